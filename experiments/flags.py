@@ -1,0 +1,196 @@
+"""The command line: absl flags made from the fields of Config, and errors of one line.
+
+Flags are defined here, for the entry points, and nowhere else in the library. Imports no jax.
+"""
+
+import difflib
+import logging
+import sys
+from collections.abc import Callable, Mapping
+from typing import Any, NoReturn
+
+from absl import app, flags
+
+from experiments.presets import ENCODER_PRESETS, PRESETS, preset_values
+from srl_jax import modes, specs
+from srl_jax.config import INFOS, Config
+from srl_jax.specs import ConfigError, Info
+
+# The flags count as the entry point's own, so that --help shows them.
+flags.disclaim_key_flags()
+
+RL_OPTIONS: dict[str, tuple[str, Info]] = {
+    "n_step": ("n_step", Info(int, "steps of the return", "env steps", minimum=1)),
+    "num_atoms": ("atoms", Info(int, "atoms of the value distribution", "atoms", minimum=2)),
+    "v_min": ("v_min", Info(float, "lowest atom", "discounted return")),
+    "v_max": ("v_max", Info(float, "highest atom", "discounted return")),
+    "noisy_std": ("noisy_std", Info(float, "noisy layers' initial noise", minimum=0)),
+    "alpha": ("alpha", Info(float, "priorities' exponent", "exponent", minimum=0)),
+}
+"""Flags that stand for an option of --rl: flag -> (option, Info). All of table 5.1 is a flag."""
+
+
+def with_rl_options(rl: str, given: Mapping[str, Any], explicit: bool) -> str:
+    """The --rl text with the values of `RL_OPTIONS`' flags merged into it.
+
+    Args:
+        rl: a specification.
+        given: flag -> value, for the flags that were given.
+        explicit: `rl` was typed beside those flags, so the two may not contradict each other;
+            otherwise (it came from a preset) the flags win.
+
+    Raises:
+        ConfigError: a contradiction, or `rl` is not the syntax.
+    """
+    if not given:
+        return rl
+    try:
+        name, options = specs.split(rl)
+    except specs.SpecError as error:
+        raise ConfigError(f"--rl={rl}: {error}") from None
+    for flag, value in given.items():
+        option, info = RL_OPTIONS[flag]
+        if explicit and option in options:
+            try:
+                same = specs.parse_value(options[option], info.kind) == value
+            except ValueError:
+                same = True  # Resolving --rl reports it, with the option's own type.
+            if not same:
+                raise ConfigError(
+                    f"--{flag}={specs.value_text(value)}: contradicts --rl={rl}; give one of them"
+                )
+        else:
+            options[option] = specs.value_text(value)
+    return specs.join(name, options)
+
+
+class _Parser(flags.ArgumentParser):
+    """Reads a flag's text by its Info, so that absl's errors give our reasons."""
+
+    def __init__(self, info: Info):
+        self.info = info
+
+    def parse(self, argument: Any) -> Any:
+        return self.info.parse(argument) if isinstance(argument, str) else argument
+
+    def flag_type(self) -> str:
+        return self.info.kind.__name__
+
+
+class _Serializer(flags.ArgumentSerializer):
+    def serialize(self, value: Any) -> str:
+        return "off" if value is None else specs.value_text(value)
+
+
+def _define(name: str, info: Info, default: Any, note: str, values: flags.FlagValues) -> None:
+    text = info.help + (f" [{info.unit}]" if info.unit else "") + note
+    if info.choices:
+        text += f"; one of: {', '.join(info.choices)}"
+    if info.kind is tuple:
+        flags.DEFINE_multi_string(name, list(default) or None, text, flag_values=values)
+        return
+    flag = flags.Flag(_Parser(info), _Serializer(), name, default, text, boolean=info.kind is bool)
+    flags.DEFINE_flag(flag, values)
+
+
+def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
+    """Defines a flag for every field of Config, `RL_OPTIONS` and --preset."""
+    for name, info in INFOS.items():
+        _define(info.flag or name, info, getattr(Config(), name), "", values)
+    for name, (option, info) in RL_OPTIONS.items():
+        _define(name, info, None, f"; short for --rl=NAME:{option}=..., and as --rl says", values)
+    flags.DEFINE_string(
+        "preset",
+        None,
+        "named settings, which the flags given beside it override; one of: " + ", ".join(PRESETS),
+        flag_values=values,
+    )
+
+
+def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool = True) -> Config:
+    """The settings that the command line asks for: defaults, then --preset, then the flags given.
+
+    Args:
+        values: parsed flags, as `define_config_flags` defines them.
+        complete: also demand the encoder that the mode or the preset starts from.
+
+    Returns:
+        A checked Config; its specifications are not yet (that takes the registries, which import
+        jax).
+
+    Raises:
+        ConfigError: unknown preset, a value out of its limits, or flags that do not fit together.
+    """
+    given = {
+        name: values[info.flag or name].value
+        for name, info in INFOS.items()
+        if values[info.flag or name].present
+    }
+    if "objectives" in given:
+        texts = tuple(given["objectives"])
+        given["objectives"] = () if texts in (("none",), ("",)) else texts
+    preset = values["preset"].value
+    settings = dict(given)
+    if values["preset"].present:
+        if preset not in PRESETS:
+            raise ConfigError(f"--preset={preset}: {specs.choices_text(preset, PRESETS)}")
+        settings = {**preset_values(preset, given.get("game")), **given}
+    shorts = {name: values[name].value for name in RL_OPTIONS if values[name].present}
+    rl = settings.get("rl", Config.rl)
+    config = Config(**{**settings, "rl": with_rl_options(rl, shorts, explicit="rl" in given)})
+
+    source = ENCODER_PRESETS.get(preset)
+    # A preset's encoder is only asked for while its mode is: --mode beside it may need none.
+    if source and config.mode == PRESETS[preset]["mode"]:
+        hint = f"--preset={source} --game={config.game} --out=PATH makes one"
+        modes.check(config, needs_encoder=True, hint=hint, complete=complete)
+    else:
+        modes.check(config, complete=complete)
+    return config
+
+
+def fail(message: Any) -> NoReturn:
+    """Prints one line on stderr and exits with status 2."""
+    print("error: " + " ".join(str(message).split()), file=sys.stderr)
+    sys.exit(2)
+
+
+def parse(argv: list[str], values: flags.FlagValues = flags.FLAGS) -> list[str]:
+    """Parses a command line; exits with one line and status 2 where it is not valid.
+
+    Args:
+        argv: the program's name and its arguments.
+        values: where the flags are defined.
+
+    Returns:
+        [the program's name].
+    """
+    try:
+        rest = values(argv)
+    except flags.UnrecognizedFlagError as error:
+        near = difflib.get_close_matches(error.flagname, list(values), n=1, cutoff=0.6)
+        suggestion = f"did you mean --{near[0]}? " if near else ""
+        fail(f"--{error.flagname}: no such flag; {suggestion}--helpfull lists them all")
+    except flags.Error as error:
+        fail(str(error).removeprefix("flag "))
+    if len(rest) > 1:
+        fail(f"unexpected argument {rest[1]!r}: write every option as --name=value; see --help")
+    return rest
+
+
+def run(main: Callable[[list[str]], Any]) -> None:
+    """Runs an entry point: parses the flags and turns bad input into one line and exit status 2.
+
+    Args:
+        main: takes [the program's name]; may raise ConfigError.
+    """
+
+    def guarded(argv: list[str]) -> Any:
+        try:
+            return main(argv)
+        except ConfigError as error:
+            fail(error)
+
+    # absl prints what libraries log, and jax logs every accelerator that it does not find.
+    logging.getLogger("jax").setLevel(logging.WARNING)
+    app.run(guarded, flags_parser=parse)

@@ -1,0 +1,122 @@
+"""Named settings for experiments.train: every arm of the thesis, a demonstration, small Catch runs.
+
+A preset is a dict of `srl_jax.config.Config` fields; what it leaves out keeps its default, and
+flags given beside it override it. The thesis is Guberina & Desta, 2022; its figures' arms keep
+their names here.
+"""
+
+from typing import Any
+
+_RECONSTRUCTION = "reconstruction:weight=1"
+_FORWARD = "forward_pixels:weight=1"
+_L2 = "latent_l2:weight=1e-6"
+
+# 50 epochs of 100,000 env steps. Pong is one of the thesis' seven games; --game takes another.
+_THESIS = {"game": "Pong", "rl": "rainbow", "steps": 5_000_000, "eval_every": 100_000}
+_256 = {**_THESIS, "encoder": "sac_ae:features=256"}
+# What the authors ran as augmentation shifts the RL batch too. --augment=srl shifts only what the
+# representation losses see.
+_AUG = {"augment": "all"}
+_JOINT = {"mode": "joint", "objectives": (_RECONSTRUCTION, _L2), "decoder_weight_decay": 1e-7}
+_JOINT_FORWARD = {**_JOINT, "objectives": (_FORWARD, _L2)}
+# 15 epochs. The thesis takes its frames from a trained agent: --policy_from=RUN, with a run of
+# thesis/rl_only_nature, say. Without it the policy is random.
+_PRETRAIN = {
+    **_JOINT,
+    "mode": "pretrain",
+    "steps": 1_500_000,
+    "batch_size": 64,
+    "updates_per_step": 0.3,
+    "pretrain_epsilon": 0.3,
+}
+
+# Small enough to learn Catch in minutes on a laptop. Exploration and the importance weights are
+# annealed within the run.
+_CATCH = {
+    "game": "Catch",
+    "rl": "rainbow",
+    "encoder": "tiny",
+    "frame_size": 42,
+    "lr_rl": 5e-4,
+    "lr_srl": 5e-4,
+    "steps": 30_000,
+    "buffer_size": 30_000,
+    "eval_every": 10_000,
+    "eps_anneal_steps": 10_000,
+    "beta_anneal_steps": 30_000,
+    "noop_max": 0,
+}
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # Figure 6.1, what a pretrained encoder can give, and its encoders.
+    "thesis/rl_only_nature": {**_THESIS, "encoder": "nature", "mode": "rl_only"},
+    "thesis/finetuned_from_rl_nature": {**_THESIS, "encoder": "nature", "mode": "finetuned"},
+    "thesis/finetuned_256_aug": {**_256, **_AUG, "mode": "finetuned"},
+    "thesis/frozen_256": {**_256, "mode": "frozen"},
+    "thesis/pretrain_256": {**_256, **_PRETRAIN},
+    "thesis/pretrain_256_aug": {**_256, **_PRETRAIN, **_AUG},
+    # Figure 6.2, the encoder's size under RL alone.
+    "thesis/rl_only_256": {**_256, "mode": "rl_only"},
+    "thesis/rl_only_256_aug": {**_256, **_AUG, "mode": "rl_only"},
+    # Figure 6.3, joint training.
+    "thesis/joint_256": {**_256, **_JOINT},
+    "thesis/joint_50": {**_256, **_JOINT, "encoder": "sac_ae:features=50"},
+    # Figure 6.4, regularisation.
+    "thesis/joint_256_l2_aug": {**_256, **_JOINT, **_AUG},
+    "thesis/joint_256_noreg": {
+        **_256,
+        **_JOINT,
+        "objectives": (_RECONSTRUCTION,),
+        "decoder_weight_decay": 0.0,
+    },
+    # Figure 6.5, forward prediction.
+    "thesis/joint_forward_256": {**_256, **_JOINT_FORWARD},
+    "thesis/joint_forward_256_aug": {**_256, **_JOINT_FORWARD, **_AUG},
+    # Figure A.1, pretrained and still updated by both losses.
+    "thesis/joint_from_pretrained_256": {**_256, **_JOINT},
+    # What `make train` runs: a look at the whole in about five minutes on two cores.
+    "demo": {
+        **_JOINT,
+        "game": "Pong",
+        "rl": "rainbow",
+        "encoder": "nature",
+        "steps": 20_000,
+        "eval_every": 10_000,
+        "eval_games": 5,
+    },
+    # One for each mode.
+    "catch/rl_only": {**_CATCH, "mode": "rl_only"},
+    "catch/pretrain": {**_CATCH, **_JOINT, "mode": "pretrain"},
+    "catch/frozen": {**_CATCH, "mode": "frozen"},
+    "catch/finetuned": {**_CATCH, "mode": "finetuned"},
+    "catch/joint": {**_CATCH, **_JOINT},
+    "catch/decoupled": {**_CATCH, **_JOINT, "mode": "decoupled"},
+}
+
+ENCODER_PRESETS: dict[str, str] = {
+    "thesis/finetuned_from_rl_nature": "thesis/rl_only_nature",
+    "thesis/finetuned_256_aug": "thesis/pretrain_256_aug",
+    "thesis/frozen_256": "thesis/pretrain_256",
+    "thesis/joint_from_pretrained_256": "thesis/pretrain_256",
+    "catch/frozen": "catch/pretrain",
+    "catch/finetuned": "catch/pretrain",
+}
+"""Presets that need --encoder_from, and the preset whose run makes that encoder."""
+
+_SOLVED = {"Pong": 20.0}
+"""Mean evaluation return at which the thesis' runs of a game stop early."""
+
+
+def preset_values(name: str, game: str | None = None) -> dict[str, Any]:
+    """The fields that a preset sets.
+
+    Args:
+        name: a key of `PRESETS`.
+        game: the game, where it is not the preset's own; a thesis run stops early in some games
+            only.
+    """
+    values = dict(PRESETS[name])
+    game = game or values["game"]
+    if name.startswith("thesis/") and values["mode"] != "pretrain" and game in _SOLVED:
+        values["stop_at_return"] = _SOLVED[game]
+    return values

@@ -1,0 +1,209 @@
+"""Trains one agent: `python -m experiments.train --preset=thesis/joint_256 --out=runs/pong`.
+
+Bad input ends with one line on stderr and exit status 2 before anything is written. What can be
+checked without jax is checked before jax is imported.
+"""
+
+import contextlib
+import importlib.util
+import json
+import os
+import shutil
+from pathlib import Path
+
+from absl import flags
+
+from experiments import flags as config_flags
+from srl_jax.config import Config, resolve
+from srl_jax.specs import ConfigError, build, parse
+
+FLAGS = flags.FLAGS
+
+
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines this entry point's flags."""
+    config_flags.define_config_flags(values)
+    flags.DEFINE_string("out", None, "run directory to make; must be new or empty", flag_values=values)
+    flags.DEFINE_boolean("overwrite", False, "delete the run that --out holds first", flag_values=values)
+    flags.DEFINE_boolean(
+        "print_config", False, "print the resolved config as JSON and exit", flag_values=values
+    )
+
+
+def check_extras(config: Config) -> None:
+    """Whether the optional packages that the run needs are installed.
+
+    Raises:
+        ConfigError: one is not; the line says which extra has it.
+    """
+    if not config.game.startswith("Catch") and importlib.util.find_spec("ale_py") is None:
+        raise ConfigError(
+            f"--game={config.game}: Atari needs ale-py, pip install 'srl-jax[atari]'; "
+            "valid without it: Catch, CatchDistractor"
+        )
+    if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
+        raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
+
+
+def check_paths(config: Config) -> None:
+    """Whether the paths that the run starts from exist.
+
+    Raises:
+        ConfigError: one does not.
+    """
+    for flag in ("encoder_from", "policy_from"):
+        path = getattr(config, flag)
+        if path and not os.path.exists(path):
+            raise ConfigError(f"--{flag}={path}: no such path; give a run directory or a checkpoint")
+
+
+def check_out(out: str | None, overwrite: bool, config: Config) -> Path:
+    """Whether a run directory can be made there; writes nothing.
+
+    Args:
+        out: the path, or None where it was not given.
+        overwrite: a run that lies there may be deleted.
+        config: what it starts from must not be deleted.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if not out:
+        raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
+    path = Path(os.path.expanduser(out))
+    try:
+        if not path.is_dir():
+            if os.path.lexists(path):
+                raise ConfigError(f"--out={out}: exists and is not a directory")
+            parent = next(p for p in path.absolute().parents if os.path.lexists(p))
+            if not parent.is_dir():
+                raise ConfigError(f"--out={out}: {parent} is not a directory")
+            if not os.access(parent, os.W_OK | os.X_OK):
+                raise ConfigError(f"--out={out}: no permission to write in {parent}")
+            return path
+        if not os.access(path, os.W_OK | os.X_OK):
+            raise ConfigError(f"--out={out}: no permission to write there")
+        if not any(path.iterdir()):
+            return path
+        if not overwrite:
+            raise ConfigError(f"--out={out}: not empty; name a new directory, or --overwrite deletes the run")
+        if path.is_symlink() or not _is_run(path):
+            raise ConfigError(f"--out={out}: not a run directory, so --overwrite does not delete it")
+    except OSError as error:
+        raise ConfigError(f"--out={out}: {error.strerror}") from None
+    kept = {"encoder_from": config.encoder_from, "policy_from": config.policy_from}
+    for flag, source in kept.items():
+        if source and Path(source).resolve().is_relative_to(path.resolve()):
+            raise ConfigError(f"--out={out}: --overwrite would delete --{flag}={source}")
+    if Path.cwd().is_relative_to(path.resolve()):
+        raise ConfigError(f"--out={out}: --overwrite would delete the working directory")
+    return path
+
+
+def _is_run(path: Path) -> bool:
+    """Whether the directory holds a config.json that this program wrote."""
+    try:
+        values = json.loads((path / "config.json").read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()
+
+
+@contextlib.contextmanager
+def run_directory(path: Path, config: Config):
+    """Makes the run directory with its config.json; unmakes it if what follows refuses the config.
+
+    Args:
+        path: as `check_out` returned it; a run that lies there is deleted.
+        config: resolved; written to config.json.
+
+    Raises:
+        ConfigError: it cannot be made.
+    """
+    try:
+        if path.is_dir() and any(path.iterdir()):
+            shutil.rmtree(path)
+    except OSError as error:
+        raise ConfigError(f"--out={path}: {error.strerror}") from None
+    made = []
+    try:
+        try:
+            missing = [p for p in (path, *path.absolute().parents) if not p.exists()]
+            for directory in reversed(missing):
+                directory.mkdir()
+                made.append(directory)
+            config.save(path)
+        except OSError as error:
+            raise ConfigError(f"--out={path}: {error.strerror}") from None
+        yield
+    except ConfigError:
+        # Only what was made here goes: once anything else lies there, all of it stays.
+        with contextlib.suppress(OSError):
+            if [file.name for file in path.iterdir()] == ["config.json"]:
+                (path / "config.json").unlink()
+        with contextlib.suppress(OSError):
+            for directory in reversed(made):
+                directory.rmdir()
+        raise
+
+
+def resolved(config: Config) -> Config:
+    """`srl_jax.config.resolve` with the project's registries, and a trial build; imports jax.
+
+    Raises:
+        ConfigError: a specification is not valid, or cannot be built for these frames.
+    """
+    from srl_jax import encoders, objectives, rl
+    from srl_jax.types import Context
+
+    full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
+    # Options may be valid one by one and not together, or not for these frames: only a factory
+    # knows. The number of actions is not known yet; any will do for that.
+    shape = (config.frame_size, config.frame_size, config.frame_stack)
+    encoder = build(parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
+    context = Context(encoder, num_actions=18)
+    build(parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
+    for text in config.objectives:
+        objective = parse(text, objectives.REGISTRY, "objective")
+        build(objective, objectives.REGISTRY, context)
+    return full
+
+
+def train(values: flags.FlagValues) -> None:
+    """Checks the command line, makes the run directory and trains.
+
+    Raises:
+        ConfigError: the command line is not valid; nothing was written.
+    """
+    config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
+    if values["print_config"].value:
+        print(resolved(config).to_json())
+        return
+    path = check_out(values["out"].value, values["overwrite"].value, config)
+    check_extras(config)
+    check_paths(config)
+    config = resolved(config)
+
+    from experiments.draw import draw_run
+    from srl_jax import checkpoint, loop
+
+    checkpoint.check_sources(config)
+    with run_directory(path, config):
+        result = loop.train(config, path)
+    if not draw_run(path, config, pictures=result.pictures):
+        print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
+    print(f"{result.env_steps} env steps, {result.updates} updates; everything is in {path}")
+
+
+def main(argv: list[str]) -> None:
+    """The entry point."""
+    del argv
+    train(FLAGS)
+
+
+if __name__ == "__main__":
+    define_flags()
+    config_flags.run(main)

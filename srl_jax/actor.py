@@ -1,0 +1,57 @@
+"""The side of the loop that faces the environments: stacks of frames, policies, schedules, seeds."""
+
+import zlib
+from collections.abc import Callable
+
+import numpy as np
+
+Policy = Callable[[np.ndarray, int, float], np.ndarray]
+"""(frames uint8 [N, S, H, W], step, epsilon) -> actions int32 [N]; its draws depend on the step."""
+
+
+class FrameStack:
+    """The last S frames of N environments; an episode's first frame stands in for those before it.
+
+    Args:
+        num_envs: N.
+        stack: S.
+        frame_shape: (H, W).
+    """
+
+    def __init__(self, num_envs: int, stack: int, frame_shape: tuple):
+        self._frames = np.zeros((num_envs, stack, *frame_shape), np.uint8)
+
+    def begin(self, frames: np.ndarray, mask: np.ndarray | None = None) -> None:
+        """Starts episodes from frames uint8 [N, H, W], where mask bool [N] says so (None: everywhere)."""
+        mask = np.ones(len(frames), bool) if mask is None else mask
+        self._frames[mask] = frames[mask][:, None]
+
+    def push(self, frames: np.ndarray) -> None:
+        """Adds the next frame of every environment, uint8 [N, H, W]."""
+        self._frames[:, :-1] = self._frames[:, 1:]
+        self._frames[:, -1] = frames
+
+    def observations(self) -> np.ndarray:
+        """uint8 [N, S, H, W], newest last: a fresh array, since jax may go on reading what it was handed."""
+        return self._frames.copy()
+
+
+def seed_for(seed: int, *purpose) -> int:
+    """A 31-bit seed for one purpose of a run (name and numbers), independent of all others."""
+    words = [zlib.crc32(p.encode()) if isinstance(p, str) else int(p) for p in purpose]
+    return int(np.random.SeedSequence([seed, *words]).generate_state(1)[0] >> 1)
+
+
+def linear(start: float, end: float, steps: int, now: int) -> float:
+    """The linear schedule from start to end over so many env steps, constant afterwards."""
+    return start + (end - start) * min(1.0, now / steps)
+
+
+def random_policy(num_actions: int, seed: int) -> Policy:
+    """The policy that draws actions uniformly; step and epsilon do not matter to it."""
+    rng = np.random.default_rng(seed)
+
+    def policy(frames: np.ndarray, step: int, epsilon: float) -> np.ndarray:
+        return rng.integers(0, num_actions, len(frames), dtype=np.int32)
+
+    return policy

@@ -1,0 +1,282 @@
+"""Every value that determines a run, each with its unit and its limits. Imports no jax.
+
+The command line's flags are generated from the fields of `Config`, so a new value is one field
+here. The defaults are table 5.1 of the thesis (Guberina & Desta, 2022) and, where the table is
+silent, its code. "Env step" is one agent decision: four emulator frames.
+"""
+
+import dataclasses
+import importlib.metadata
+import json
+import platform
+import subprocess
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from srl_jax import modes, specs
+from srl_jax.envs import GAMES
+from srl_jax.specs import ConfigError, Info
+
+_PACKAGES = (
+    "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
+)  # fmt: skip
+_ABOUT = ("versions", "git_revision")
+"""What config.json holds beside the fields of Config."""
+
+
+def _value(kind: type, default: Any, help: str, unit: str = "", **limits: Any) -> Any:
+    return dataclasses.field(default=default, metadata={"info": Info(kind, help, unit, **limits)})
+
+
+def _steps(default: int, help: str, minimum: int = 1, unit: str = "env steps") -> Any:
+    return _value(int, default, help, unit, minimum=minimum)
+
+
+def _share(default: float, help: str, unit: str = "probability") -> Any:
+    return _value(float, default, help, unit, minimum=0, maximum=1)
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Every value that determines a run. Each is checked on construction; see the fields' metadata.
+
+    Raises:
+        ConfigError: a value is of the wrong type or out of its limits; one line that names the
+            flag.
+    """
+
+    game: str = _value(str, "Pong", "an Atari-57 game, Catch or CatchDistractor", choices=tuple(GAMES))
+    mode: str = _value(
+        str, "rl_only", "; ".join(f"{m.name}: {m.help}" for m in modes.MODES.values()),
+        choices=tuple(modes.MODES),
+    )  # fmt: skip
+    rl: str = _value(str, "rainbow", "RL algorithm, name:key=value,...")
+    encoder: str = _value(str, "nature", "encoder that all losses share, name:key=value,...")
+    objectives: tuple[str, ...] = _value(
+        tuple, (), "representation loss, name:key=value,...; may be repeated; none for none",
+        flag="objective",
+    )  # fmt: skip
+    augment: str = _value(
+        str, "none", "random shift of the frames that these losses see (srl: the representation's)",
+        choices=("none", "srl", "all"),
+    )  # fmt: skip
+    target_encoder: str = _value(
+        str, "slow", "encoder under the target network: its slow copy, or the online one",
+        choices=("slow", "online"),
+    )  # fmt: skip
+    seed: int = _value(int, 0, "seed of everything random", minimum=0, maximum=2**31 - 1)
+
+    steps: int = _steps(5_000_000, "length of the run")
+    num_envs: int = _value(
+        int, 10, "training environments; each moves one env step between updates", "environments",
+        minimum=1,
+    )  # fmt: skip
+    buffer_size: int = _steps(100_000, "capacity of the replay buffer", unit="transitions")
+    batch_size: int = _steps(32, "batch of one update", unit="transitions")
+    updates_per_step: float = _value(
+        float, 0.1, "gradient updates for each env step", "updates per env step", above=0
+    )
+    learn_start: int = _steps(320, "when learning starts", minimum=0)
+    gamma: float = _share(0.99, "discount", "per env step")
+
+    lr_rl: float = _value(float, 1e-4, "Adam's learning rate of the RL head", minimum=0)
+    lr_srl: float = _value(float, 1e-4, "Adam's learning rate of the representation heads", minimum=0)
+    lr_encoder: float = _value(
+        float, 0.0,
+        "Adam's learning rate of the encoder; 0: lr_rl where RL trains it, else lr_srl",
+        minimum=0,
+    )  # fmt: skip
+    decoder_weight_decay: float = _value(
+        float, 1e-7, "L2 weight decay of the decoders, added before Adam's scaling", minimum=0
+    )
+    max_grad_norm: float = _value(
+        float, 0.0, "global gradient norm that updates are clipped to; 0: no clipping", minimum=0
+    )
+    adam_eps: float = _value(float, 1e-8, "Adam's epsilon", above=0)
+
+    beta: float = _share(0.4, "importance weights' exponent at the start", "exponent")
+    beta_final: float = _share(1.0, "importance weights' exponent at the end", "exponent")
+    beta_anneal_steps: int = _steps(5_000_000, "length of beta's linear schedule")
+    eps_train: float = _share(1.0, "epsilon of the training policy at the start")
+    eps_final: float = _share(0.05, "epsilon of the training policy at the end")
+    eps_anneal_steps: int = _steps(1_000_000, "length of epsilon's linear schedule")
+    eps_eval: float = _share(0.005, "epsilon at evaluation")
+    slow_update_every: int = _steps(500, "how often the slow network is copied", unit="updates")
+
+    eval_every: int = _steps(100_000, "how often the policy is evaluated (one epoch)")
+    eval_games: int = _value(int, 10, "full games of one evaluation", "games", minimum=1)
+    eval_max_steps: int = _steps(27_000, "longest evaluation game (27,000 are 108,000 frames)")
+    stop_at_return: float | None = _value(
+        float, None, "mean evaluation return that ends the run early, or off", "unclipped score",
+        optional=True,
+    )  # fmt: skip
+    log_every: int = _steps(1_000, "how often a train row is written to metrics.jsonl")
+    checkpoint_every: int = _steps(
+        0, "how often a checkpoint is written; 0: as often as evaluation", minimum=0
+    )
+    tensorboard: bool = _value(bool, False, "also write TensorBoard events")
+
+    reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
+    life_loss: bool = _value(bool, True, "a lost life ends the return (not the game) in training")
+    sticky_actions: float = _share(0.0, "that the emulator repeats the last action")
+    noop_max: int = _value(int, 30, "most random no-ops at the start of a game", "env steps", minimum=0)
+    frame_size: int = _value(
+        int, 84, "height and width of a frame; Catch knows 42 and 84", "pixels", minimum=1
+    )
+    frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1)
+
+    encoder_from: str = _value(str, "", "run directory or checkpoint that the encoder starts from")
+    policy_from: str = _value(
+        str, "", "run directory or checkpoint whose policy --mode=pretrain acts with; empty: random"
+    )
+    pretrain_epsilon: float = _share(0.3, "epsilon of the policy that --mode=pretrain acts with")
+
+    def __post_init__(self):
+        if isinstance(self.objectives, list):
+            object.__setattr__(self, "objectives", tuple(self.objectives))
+        for name, info in INFOS.items():
+            value = getattr(self, name)
+            # JSON and people write 1 for 1.0; one type keeps the round trip exact.
+            if info.kind is float and type(value) is int:
+                value = float(value)
+                object.__setattr__(self, name, value)
+            right_type = type(value) is info.kind or (info.optional and value is None)
+            if right_type and info.kind is tuple:
+                right_type = all(type(element) is str for element in value)
+            flag = info.flag or name
+            if not right_type:
+                raise ConfigError(f"--{flag}={value!r}: not of type {info.kind.__name__}")
+            if isinstance(value, float) and not abs(value) < float("inf"):
+                raise ConfigError(f"--{flag}={value}: not a finite number")
+            try:
+                info.check(value)
+            except ValueError as error:
+                raise ConfigError(f"--{flag}={value}: {error}") from None
+        self._check_together()
+
+    def _check_together(self) -> None:
+        if self.game.startswith("Catch") and self.frame_size not in (42, 84):
+            raise ConfigError(f"--frame_size={self.frame_size}: --game={self.game} knows 42 and 84")
+        for name in ("batch_size", "learn_start"):
+            if getattr(self, name) > self.buffer_size:
+                value = f"--{name}={getattr(self, name)}"
+                raise ConfigError(f"{value}: must be at most --buffer_size={self.buffer_size}")
+
+    def to_json(self) -> str:
+        """The fields as an indented JSON object; `from_json` gives this Config again, exactly."""
+        return json.dumps(dataclasses.asdict(self), indent=2)
+
+    @classmethod
+    def from_json(cls, text: str) -> "Config":
+        """Reads `to_json`'s text, or a run's config.json. A missing field takes its default.
+
+        Raises:
+            ConfigError: not a JSON object, an unknown field, or a value out of its limits.
+        """
+        try:
+            values = json.loads(text)
+        except ValueError as error:
+            raise ConfigError(f"config: not JSON: {error}") from None
+        if not isinstance(values, dict):
+            raise ConfigError("config: not a JSON object")
+        values = {name: value for name, value in values.items() if name not in _ABOUT}
+        for name in values:
+            if name not in INFOS:
+                raise ConfigError(f"config: no field {name!r}; {specs.choices_text(name, INFOS)}")
+        return cls(**values)
+
+    @classmethod
+    def load(cls, run: str | Path) -> "Config":
+        """Reads config.json of a run directory.
+
+        Raises:
+            ConfigError: there is none, or it is not a Config.
+        """
+        path = Path(run) / "config.json"
+        try:
+            return cls.from_json(path.read_text(encoding="utf-8"))
+        except OSError as error:
+            raise ConfigError(f"{path}: {error.strerror}; not a run directory") from None
+        except ConfigError as error:
+            raise ConfigError(f"{path}: {error}") from None
+
+    def save(self, run: str | Path) -> None:
+        """Writes a run's config.json: the fields, package versions and the git revision."""
+        about = {"versions": versions(), "git_revision": git_revision()}
+        text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)
+        (Path(run) / "config.json").write_text(text + "\n", encoding="utf-8")
+
+
+INFOS: dict[str, Info] = {f.name: f.metadata["info"] for f in dataclasses.fields(Config)}
+"""The fields of Config, in order."""
+
+
+def resolve(
+    config: Config,
+    rl_registry: Mapping[str, Callable],
+    encoder_registry: Mapping[str, Callable],
+    objective_registry: Mapping[str, Callable],
+) -> Config:
+    """Writes out everything that the config leaves to a default: all options, rates and intervals.
+
+    Returns:
+        A Config that resolves to itself; what config.json holds.
+
+    Raises:
+        ConfigError: a specification is not valid; one line that names the flag.
+    """
+    rl = specs.parse(config.rl, rl_registry, "rl")
+    encoder = specs.parse(config.encoder, encoder_registry, "encoder")
+    objectives = [specs.parse(text, objective_registry, "objective") for text in config.objectives]
+    names = [objective.name for objective in objectives]
+    for objective in objectives:
+        if names.count(objective.name) > 1:
+            raise ConfigError(f"--objective={objective}: {objective.name} is given twice")
+    return dataclasses.replace(
+        config,
+        rl=rl.full,
+        encoder=encoder.full,
+        objectives=tuple(objective.full for objective in objectives),
+        lr_encoder=modes.encoder_learning_rate(config),
+        checkpoint_every=config.checkpoint_every or config.eval_every,
+    )
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, the platform and the packages that a run's numbers depend on."""
+    found = {"python": platform.python_version(), "platform": platform.platform()}
+    for package in _PACKAGES:
+        try:
+            found[package] = importlib.metadata.version(package)
+        except importlib.metadata.PackageNotFoundError:
+            pass  # An extra that is not installed, or a checkout that is run in place.
+    return found
+
+
+def git_revision() -> str | None:
+    """The commit of the checkout that this package lies in, `-dirty` if tracked files differ from
+    it.
+
+    None where there is no git, no commit, or the package is merely installed below another
+    checkout.
+    """
+    root = Path(__file__).resolve().parents[1]
+
+    def git(*arguments: str) -> str:
+        done = subprocess.run(
+            ["git", "-C", str(root), *arguments],
+            capture_output=True,
+            text=True,
+            timeout=10,
+            check=True,
+        )
+        return done.stdout.strip()
+
+    try:
+        if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
+            return None
+        revision = git("rev-parse", "--verify", "HEAD")
+        return revision + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
+    except (OSError, subprocess.SubprocessError):
+        return None

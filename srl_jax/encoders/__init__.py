@@ -1,0 +1,49 @@
+"""The encoders: `REGISTRY[name](observation_shape, **options) -> Encoder`, a row each.
+
+`observation_shape` is (H, W, S). Each comes with the decoder that mirrors it.
+"""
+
+from srl_jax.encoders.convolutional import Layer, convolutional
+from srl_jax.types import Encoder
+
+__all__ = ["REGISTRY", "nature", "sac_ae", "tiny"]
+
+
+def nature(observation_shape: tuple) -> Encoder:
+    """The encoder of Mnih et al. (2015): no bottleneck, 3,136 features at 84 x 84.
+
+    Its decoder ends in a sigmoid, as in the thesis' code.
+    """
+    layers = [Layer(32, 8, 4), Layer(64, 4, 2), Layer(64, 3, 1)]
+    return convolutional(observation_shape, layers, sigmoid=True)
+
+
+def sac_ae(observation_shape: tuple, *, features: int = 256, layer_norm: bool = True) -> Encoder:
+    """The thesis' larger encoder, after SAC-AE (Yarats et al. 2021, appendix B.2).
+
+    Args:
+        features: size of the bottleneck; the thesis has 50 and 256.
+        layer_norm: LayerNorm before the tanh (in the thesis' code, not in its text).
+
+    Raises:
+        ValueError: where features is 0 or the frames are too small.
+    """
+    if features < 1:
+        raise ValueError("features must be at least 1")
+    layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
+    return convolutional(observation_shape, layers, features=features, layer_norm=layer_norm)
+
+
+def tiny(observation_shape: tuple, *, features: int = 64) -> Encoder:
+    """A small encoder for tests and for Catch: two convolutions and a bottleneck.
+
+    Raises:
+        ValueError: where features is 0 or the frames are too small.
+    """
+    if features < 1:
+        raise ValueError("features must be at least 1")
+    layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
+    return convolutional(observation_shape, layers, features=features)
+
+
+REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny}

@@ -1,0 +1,145 @@
+"""Convolutional encoders and the decoders that mirror them, as tables of layers."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax.numpy as jnp
+
+from srl_jax.layers import Conv, ConvTranspose, Dense
+from srl_jax.types import Array, Decoder, Encoder
+
+
+class Layer(NamedTuple):
+    """One convolution: output channels, side of the kernel and stride, both in pixels."""
+
+    channels: int
+    kernel: int
+    stride: int
+
+
+class EncoderNetwork(nn.Module):
+    """Convolutions with ReLU, flatten, and an optional bottleneck: linear, LayerNorm, tanh.
+
+    Attributes:
+        layers: the convolutions, from the image on.
+        features: the bottleneck's size; 0 leaves it out, and the flattened maps are the latent.
+        layer_norm: LayerNorm between the bottleneck's linear layer and its tanh, as in SAC-AE.
+    """
+
+    layers: Sequence[Layer]
+    features: int = 0
+    layer_norm: bool = True
+
+    @nn.compact
+    def __call__(self, observation: Array) -> Array:
+        x = to_unit(observation)
+        for layer in self.layers:
+            x = nn.relu(Conv(*layer)(x))
+        x = x.reshape(x.shape[0], -1)
+        if not self.features:
+            return x
+        x = Dense(self.features)(x)
+        if self.layer_norm:
+            x = nn.LayerNorm(epsilon=1e-5)(x)
+        return jnp.tanh(x)
+
+
+class DecoderNetwork(nn.Module):
+    """The mirror of `EncoderNetwork`: layers flipped, convolutions transposed.
+
+    An encoder with a bottleneck gives it [B, features + extra], which a linear layer and ReLU turn into
+    maps. Without one the latent is reshaped, and the extra inputs become constant maps beside it.
+
+    Attributes:
+        layers: the encoder's.
+        sizes: side of each layer's input in the encoder, image first, and the last layer's output's.
+        channels: the image's channels.
+        latent: the latent's size, without the extra inputs.
+        bottleneck: whether the encoder ends in one.
+        sigmoid: whether the last layer's output goes through a sigmoid.
+    """
+
+    layers: Sequence[Layer]
+    sizes: Sequence[int]
+    channels: int
+    latent: int
+    bottleneck: bool
+    sigmoid: bool
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        side, maps = self.sizes[-1], self.layers[-1].channels
+        if self.bottleneck:
+            x = nn.relu(Dense(side * side * maps)(x)).reshape(-1, side, side, maps)
+        else:
+            extra = x[:, None, None, self.latent :]
+            x = x[:, : self.latent].reshape(-1, side, side, maps)
+            extra = jnp.broadcast_to(extra, (*x.shape[:3], extra.shape[-1]))
+            x = jnp.concatenate([x, extra], -1)
+        outputs = [self.channels] + [layer.channels for layer in self.layers[:-1]]
+        for i in reversed(range(len(self.layers))):
+            _, kernel, stride = self.layers[i]
+            x = ConvTranspose(outputs[i], kernel, stride, self.sizes[i])(x)
+            if i:
+                x = nn.relu(x)
+        return nn.sigmoid(x) if self.sigmoid else x
+
+
+def convolutional(
+    observation_shape: tuple,
+    layers: Sequence[Layer],
+    *,
+    features: int = 0,
+    layer_norm: bool = True,
+    sigmoid: bool = False,
+) -> Encoder:
+    """An `Encoder` from a table of layers.
+
+    Args:
+        observation_shape: (H, W, S), with H = W.
+        layers: its convolutions.
+        features: size of the bottleneck; 0 for none.
+        layer_norm: see `EncoderNetwork`.
+        sigmoid: whether the decoder ends in a sigmoid (in (0, 1)) or is linear at the end.
+
+    Raises:
+        ValueError: where the image is not square or too small for the layers.
+    """
+    height, width, channels = observation_shape
+    if height != width:
+        raise ValueError(f"frames must be square, not {height} x {width}")
+    sizes = [height]
+    for layer in layers:
+        if sizes[-1] < layer.kernel:
+            raise ValueError(
+                f"frames of {height} pixels are too small: a kernel of {layer.kernel} would see {sizes[-1]}"
+            )
+        sizes.append((sizes[-1] - layer.kernel) // layer.stride + 1)
+    layers, sizes = tuple(layers), tuple(sizes)
+    network = EncoderNetwork(layers, features, layer_norm)
+    latent = features or sizes[-1] ** 2 * layers[-1].channels
+    image = jnp.zeros((1, *observation_shape))
+
+    def make_decoder(extra_inputs: int = 0) -> Decoder:
+        decoder = DecoderNetwork(layers, sizes, channels, latent, bool(features), sigmoid)
+        z = jnp.zeros((1, latent + extra_inputs))
+        return Decoder(
+            init=lambda key: decoder.init(key, z)["params"],
+            apply=lambda params, x: decoder.apply({"params": params}, x),
+        )
+
+    return Encoder(
+        init=lambda key: network.init(key, image)["params"],
+        apply=lambda params, x: network.apply({"params": params}, x),
+        features=latent,
+        observation_shape=(height, width, channels),
+        make_decoder=make_decoder,
+    )
+
+
+def to_unit(observation: Array) -> Array:
+    """uint8 0..255 -> float32 in [0, 1]; float32 passes as it is."""
+    if observation.dtype == jnp.uint8:
+        return observation.astype(jnp.float32) / 255.0
+    return observation

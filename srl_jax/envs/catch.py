@@ -1,0 +1,250 @@
+"""Catch: a small pixel game whose true state is known, for trying an idea within a minute.
+
+A ball of 3 x 3 pixels falls with a constant sideways drift that the walls reflect; a paddle of
+13 x 3 pixels at the bottom has to be under it. One ball is one episode of 17 to 24 env steps, with
+reward 1 for a catch and -1 for a miss at its end, 0 before. The paddle is fast enough to catch any
+ball by following it.
+
+The game is in the spirit of the Catch of bsuite (Osband et al., 2020), with velocities that a
+single frame does not show.
+"""
+
+import numpy as np
+
+from srl_jax.envs.base import FrameVectorEnv
+
+GRID = 84
+"""The game is played on an integer grid of GRID x GRID, whatever the size of the frames."""
+ACTIONS = ("LEFT", "NOOP", "RIGHT")
+
+BALL_RADIUS = 1
+PADDLE_RADIUS = 6
+PADDLE_SPEED = 4
+PADDLE_ROW = GRID - 7
+"""High enough for an encoder that drops the last rows: `nature` and `tiny` see 40 and 42 of 42."""
+LAST_ROW = PADDLE_ROW - 3
+"""The ball's row when it touches the paddle: rows 73 to 75 over rows 76 to 78. They share no
+pixel at size 42 either."""
+REACH = PADDLE_RADIUS + BALL_RADIUS
+"""Largest distance between the centres at which ball and paddle share a column."""
+BALL_LEFT, BALL_RIGHT = BALL_RADIUS, GRID - 1 - BALL_RADIUS
+PADDLE_LEFT, PADDLE_RIGHT = PADDLE_RADIUS, GRID - 1 - PADDLE_RADIUS
+
+DROPS = np.array([(3, t) for t in range(20, 25)] + [(4, t) for t in range(17, 19)])
+"""Speed of the fall in rows per step, and the number of steps until the ball lands."""
+MAX_DRIFT = 3
+"""Columns per step; less than the paddle's speed."""
+
+BRIGHTNESS = 252
+"""Of ball and paddle. A multiple of 4, so that a quarter of a pixel is exact too."""
+
+LAYER_BRIGHTNESS = 100
+"""The background is a sum of two layers in [0, LAYER_BRIGHTNESS], darker than ball and paddle."""
+TORUS = 2 * GRID
+"""Period of the background's textures in pixels of the grid."""
+MAX_SCROLL = 3
+"""Pixels of the grid per step."""
+SCROLL_STEPS = 32
+"""Env steps between two changes of the background's velocities."""
+
+
+class Catch(FrameVectorEnv):
+    """N games of Catch; with `distractor` in front of a moving texture.
+
+    The background of `CatchDistractor` is a sum of two smooth textures that scroll in directions
+    that change at random every 32 env steps. It depends on the seed, the environment's index and
+    the number of steps taken, never on actions or episodes: a reset does not touch it unless it is
+    given a seed. The textures belong to the game and are the same for every seed. The balls of both
+    games are the same for the same seed.
+
+    The k-th episode of an environment is a function of the seed, the environment's index and k.
+
+    `info` holds `life_lost` bool [N], always False, and `state` float32 [N, 5]: column and row of
+    the ball's centre, its velocity in columns and rows per env step (for the next move, but for a
+    bounce in it), and the column of the paddle's centre. Units are pixels of a frame of 84 x 84,
+    counted from 0 at the top left pixel. At size 42, a pixel of Catch is the mean of 2 x 2 of
+    these.
+    """
+
+    def __init__(self, *, num_envs: int, seed: int, size: int = 84, distractor: bool = False):
+        """Sets up N games.
+
+        Args:
+            num_envs: how many copies, N.
+            seed: the source of all randomness.
+            size: height and width of a frame in pixels, 84 or 42.
+            distractor: the moving background.
+
+        Raises:
+            ValueError: num_envs, seed or size are out of their range.
+        """
+        if size not in (GRID, GRID // 2):
+            raise ValueError(f"the frame size of Catch must be 84 or 42, got {size}")
+        super().__init__(num_envs=num_envs, seed=seed, frame_size=size, action_meanings=ACTIONS)
+        self._ball_x, self._ball_y, self._drift, self._fall, self._paddle = np.zeros((5, num_envs), np.int64)
+        self._episodes = np.zeros(num_envs, np.int64)
+        scale = GRID // size
+        self._rows = np.arange(num_envs)[:, None, None]
+        self._ball_sprite = sprite(BALL_RADIUS, scale)
+        self._paddle_sprite = sprite(PADDLE_RADIUS, scale)
+        paddle_index, paddle_cover = sprite(1, scale)
+        self._paddle_height = paddle_index[[PADDLE_ROW]], paddle_cover[[PADDLE_ROW]]
+        self._background = Background(num_envs, scale, self._stream) if distractor else None
+
+    def _reset(self, mask, seeded):
+        if seeded:
+            self._episodes[mask] = 0
+        if self._background is not None and (seeded or not self._started):
+            self._background.restart(mask)
+        for i in np.flatnonzero(mask):
+            rng = np.random.default_rng(self._stream(i, 0, int(self._episodes[i])))
+            self._fall[i], steps = DROPS[rng.integers(len(DROPS))]
+            self._ball_x[i] = rng.integers(BALL_LEFT, BALL_RIGHT + 1)
+            self._ball_y[i] = LAST_ROW - steps * self._fall[i]
+            self._drift[i] = rng.integers(-MAX_DRIFT, MAX_DRIFT + 1)
+            # Near the middle, so that following the ball leaves a few steps to spare.
+            self._paddle[i] = rng.integers(GRID // 2 - 18, GRID // 2 + 18)
+        self._episodes[mask] += 1
+        return self._frames(), self._info()
+
+    def _step(self, actions):
+        paddle = self._paddle + PADDLE_SPEED * (actions.astype(np.int64) - 1)
+        self._paddle = np.clip(paddle, PADDLE_LEFT, PADDLE_RIGHT)
+        x = self._ball_x + self._drift
+        bounced = (x < BALL_LEFT) | (x > BALL_RIGHT)
+        self._ball_x = np.where(
+            x < BALL_LEFT, 2 * BALL_LEFT - x, np.where(x > BALL_RIGHT, 2 * BALL_RIGHT - x, x)
+        )
+        self._drift = np.where(bounced, -self._drift, self._drift)
+        self._ball_y = self._ball_y + self._fall
+        if self._background is not None:
+            self._background.step()
+        landed = self._ball_y >= LAST_ROW
+        caught = np.abs(self._ball_x - self._paddle) <= REACH
+        rewards = np.where(landed, np.where(caught, 1, -1), 0).astype(np.float32)
+        return self._frames(), rewards, landed, np.zeros(self.num_envs, bool), self._info()
+
+    def _info(self):
+        state = (self._ball_x, self._ball_y, self._drift, self._fall, self._paddle)
+        return {
+            "life_lost": np.zeros(self.num_envs, bool),
+            "state": np.stack(state, axis=1).astype(np.float32),
+        }
+
+    def _frames(self):
+        shape = (self.num_envs, *self.single_observation_space.shape)
+        frames = np.zeros(shape, np.uint8) if self._background is None else self._background.draw()
+        index, cover = self._paddle_sprite
+        self._draw(frames, *self._paddle_height, index[self._paddle], cover[self._paddle])
+        index, cover = self._ball_sprite
+        y, x = self._ball_y, self._ball_x
+        self._draw(frames, index[y], cover[y], index[x], cover[x])
+        return frames
+
+    def _draw(self, frames, rows, row_cover, columns, column_cover):
+        """Blends one bright rectangle per environment into the frames, by the area it covers."""
+        at = (self._rows, rows[:, :, None], columns[:, None, :])
+        cover = row_cover[:, :, None] * column_cover[:, None, :]
+        behind = frames[at]
+        frames[at] = np.rint(behind + cover * (np.float32(BRIGHTNESS) - behind)).astype(np.uint8)
+
+
+class Background:
+    """Two scrolling textures per environment, added.
+
+    Args:
+        num_envs: N.
+        scale: pixels of the grid per pixel of a frame.
+        stream: (environment, *purpose) -> its SeedSequence.
+    """
+
+    def __init__(self, num_envs: int, scale: int, stream):
+        self._scale = scale
+        self._stream = stream
+        self._size = GRID // scale
+        self._layers = [texture(layer, scale) for layer in range(2)]
+        self._time = np.zeros(num_envs, np.int64)
+        self._offset = np.zeros((num_envs, 2, 2), np.int64)  # environment, layer, row or column
+        self._velocity = np.zeros_like(self._offset)
+
+    def restart(self, mask: np.ndarray):
+        """Puts the environments of the mask, bool [N], to the start of their streams."""
+        self._time[mask] = 0
+        for i in np.flatnonzero(mask):
+            rng = np.random.default_rng(self._stream(i, 1))
+            self._offset[i] = rng.integers(TORUS, size=(2, 2))
+            self._turn(i)
+
+    def step(self):
+        """Scrolls all environments by one env step."""
+        self._offset = (self._offset + self._velocity) % TORUS
+        self._time += 1
+        for i in np.flatnonzero(self._time % SCROLL_STEPS == 0):
+            self._turn(i)
+
+    def _turn(self, i):
+        rng = np.random.default_rng(self._stream(i, 2, int(self._time[i])))
+        # Never zero, so that both layers always move.
+        speed = rng.integers(1, MAX_SCROLL + 1, size=(2, 2))
+        self._velocity[i] = speed * rng.choice((-1, 1), size=(2, 2))
+
+    def draw(self) -> np.ndarray:
+        """The frames, uint8 [N, H, W]."""
+        size = self._size
+        frames = np.empty((len(self._time), size, size), np.uint8)
+        first, second = self._layers
+        for frame, ((y0, x0), (y1, x1)) in zip(frames, (self._offset // self._scale).tolist(), strict=True):
+            np.add(
+                first[y0 : y0 + size, x0 : x0 + size],
+                second[y1 : y1 + size, x1 : x1 + size],
+                out=frame,
+            )
+        return frames
+
+
+def sprite(radius: int, scale: int) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels of a frame a bar of 2 * radius + 1 grid cells covers in one dimension.
+
+    Args:
+        radius: of the bar, in grid cells.
+        scale: grid cells per pixel of the frame.
+
+    Returns:
+        index: int64 [GRID, M], for each centre the M neighbouring pixels that it may cover; always
+            within the frame.
+        cover: float32 [GRID, M] in [0, 1], the part of each that is covered, a multiple of
+            1 / scale.
+    """
+    size = GRID // scale
+    pixels = np.arange(size) * scale
+    index, cover = [], []
+    width = (2 * radius + scale) // scale
+    for centre in range(GRID):
+        low, high = centre - radius, centre + radius + 1
+        overlap = np.minimum(high, pixels + scale) - np.maximum(low, pixels)
+        first = min(max(low // scale, 0), size - width)
+        index.append(np.arange(first, first + width))
+        cover.append(np.clip(overlap[index[-1]], 0, scale) / scale)
+    return np.array(index), np.array(cover, np.float32)
+
+
+def texture(layer: int, scale: int) -> np.ndarray:
+    """A smooth periodic texture, laid out so that every window is a slice.
+
+    Args:
+        layer: which one.
+        scale: pixels of the grid per pixel of the texture.
+
+    Returns:
+        uint8 [(TORUS + GRID) / scale] squared; values spread evenly over [0, LAYER_BRIGHTNESS].
+    """
+    # White noise through a Gaussian low-pass, then ranked so that its histogram is flat.
+    noise = np.random.default_rng(np.random.SeedSequence((84, layer))).normal(size=(TORUS, TORUS))
+    cycles = np.fft.fftfreq(TORUS) * TORUS
+    low_pass = np.exp(-0.5 * (cycles[:, None] ** 2 + cycles[None, :] ** 2) / 8.0**2)
+    smooth = np.fft.ifft2(np.fft.fft2(noise) * low_pass).real
+    ranks = smooth.ravel().argsort().argsort().reshape(smooth.shape)
+    values = ranks * (LAYER_BRIGHTNESS / (TORUS * TORUS - 1))
+    small = TORUS // scale
+    values = values.reshape(small, scale, small, scale).mean((1, 3)).round().astype(np.uint8)
+    return np.pad(values, ((0, GRID // scale), (0, GRID // scale)), mode="wrap")

@@ -1,0 +1,79 @@
+"""Full games, unclipped scores."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from srl_jax.actor import FrameStack, Policy
+
+
+class Evaluation(NamedTuple):
+    """What came of the games, in the order in which they were dealt out.
+
+    Attributes:
+        returns: the raw score of each game, undiscounted.
+        lengths: env steps of each game.
+        frames: uint8 [T, H, W], the first game as it was seen; empty unless asked for.
+    """
+
+    returns: list[float]
+    lengths: list[int]
+    frames: np.ndarray
+
+
+def evaluate(
+    policy: Policy,
+    env,
+    *,
+    games: int,
+    seed: int,
+    epsilon: float,
+    stack: int = 4,
+    max_steps: int = 27_000,
+    record: bool = False,
+) -> Evaluation:
+    """Plays full games: a lost life ends nothing, rewards are the game's own.
+
+    Each environment plays its share, game i in environment i mod N, so that short games are not favoured.
+
+    Args:
+        policy: acts for all N environments at once.
+        env: a vector environment of `srl_jax.envs`.
+        games: how many.
+        seed: same seed, same policy: same games.
+        epsilon: given to the policy.
+        stack: frames in an observation.
+        max_steps: env steps after which a game is cut, its score counted as it stands.
+        record: keep the first game's frames.
+    """
+    number = env.num_envs
+    shape = env.single_observation_space.shape
+    stacks = FrameStack(number, stack, shape)
+    frames, _ = env.reset(seed=seed)
+    stacks.begin(frames)
+    scores = [[] for _ in range(number)]
+    share = [len(range(i, games, number)) for i in range(number)]
+    score, length = np.zeros(number), np.zeros(number, int)
+    recorded = [frames[0]] if record else []
+    step = 0
+    while any(len(done) < wanted for done, wanted in zip(scores, share, strict=True)):
+        frames, rewards, terminated, truncated, _ = env.step(policy(stacks.observations(), step, epsilon))
+        step += 1
+        score += rewards
+        length += 1
+        stacks.push(frames)
+        if record and not scores[0]:
+            recorded.append(frames[0])
+        over = terminated | truncated | (length >= max_steps)
+        if over.any():
+            for i in np.flatnonzero(over):
+                scores[i].append((float(score[i]), int(length[i])))
+            score[over], length[over] = 0.0, 0
+            frames, _ = env.reset(options={"reset_mask": over})
+            stacks.begin(frames, over)
+    played = [scores[i % number][i // number] for i in range(games)]
+    return Evaluation(
+        returns=[r for r, _ in played],
+        lengths=[n for _, n in played],
+        frames=np.stack(recorded) if recorded else np.zeros((0, *shape), np.uint8),
+    )

@@ -1,0 +1,136 @@
+"""Layers that flax lacks, or whose gradient XLA's CPU backend computes badly.
+
+Convolutions here are VALID convolutions over explicitly padded inputs. XLA's CPU backend differentiates a
+transposed, dilated or internally padded convolution with respect to its kernel on a naive path, ten times
+slower than the same layer written as a pad and a VALID convolution.
+"""
+
+import math
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from srl_jax.types import Array
+
+
+def uniform_fan_in(fan_in: int):
+    """An initialiser: U(-1/sqrt(fan_in), 1/sqrt(fan_in)), for kernels and biases alike.
+
+    PyTorch's default for linear and convolutional layers, which the thesis ran with.
+    """
+    bound = 1.0 / math.sqrt(fan_in)
+
+    def init(key, shape, dtype=jnp.float32):
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return init
+
+
+class Dense(nn.Module):
+    """A linear layer, float32 [B, inputs] -> [B, features]; PyTorch's default initialisation."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        init = uniform_fan_in(x.shape[-1])
+        kernel = self.param("kernel", init, (x.shape[-1], self.features))
+        bias = self.param("bias", init, (self.features,))
+        return x @ kernel + bias
+
+
+class Conv(nn.Module):
+    """A VALID convolution, float32 [B, H, W, C] -> [B, H', W', features]; PyTorch's initialisation."""
+
+    features: int
+    kernel: int
+    stride: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        init = uniform_fan_in(self.kernel**2 * x.shape[-1])
+        kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
+        bias = self.param("bias", init, (self.features,))
+        return _valid_conv(x, kernel, self.stride) + bias
+
+
+class ConvTranspose(nn.Module):
+    """A transposed convolution as a VALID one: float32 [B, h, w, C] -> [B, H, W, features].
+
+    With stride s, output pixel `y * s + r` is `sum_j x[y - j] @ kernel[j * s + r]`: an ordinary convolution
+    with ceil(kernel / s) taps and s * s * features channels, followed by depth-to-space. No zero is ever
+    multiplied, and its gradient is that of an ordinary convolution.
+
+    Attributes:
+        features: output channels.
+        kernel: side of the kernel, in pixels; its parameter is [kernel, kernel, C, features].
+        stride: the factor by which the image grows.
+        size: side of the output, in pixels; at least `(h - 1) * stride + kernel`, and less than `stride`
+            above it (what PyTorch calls output padding): what the mirrored layer saw.
+    """
+
+    features: int
+    kernel: int
+    stride: int
+    size: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        k, s, channels = self.kernel, self.stride, x.shape[-1]
+        height = x.shape[1]
+        if not 0 <= self.size - ((height - 1) * s + k) < s:
+            raise ValueError(f"a kernel of {k} with stride {s} cannot make {self.size} pixels from {height}")
+        init = uniform_fan_in(k**2 * self.features)  # PyTorch counts the output side here
+        kernel = self.param("kernel", init, (k, k, channels, self.features))
+        bias = self.param("bias", init, (self.features,))
+        taps = -(-k // s)
+        kernel = jnp.pad(kernel, [(0, taps * s - k)] * 2 + [(0, 0)] * 2)
+        kernel = kernel.reshape(taps, s, taps, s, channels, self.features)[::-1, :, ::-1]
+        kernel = kernel.transpose(0, 2, 4, 1, 3, 5).reshape(taps, taps, channels, -1)
+        x = jnp.pad(x, [(0, 0)] + [(taps - 1, taps - 1)] * 2 + [(0, 0)])
+        x = _valid_conv(x, kernel, 1)
+        batch, rows = x.shape[:2]
+        x = x.reshape(batch, rows, rows, s, s, self.features).transpose(0, 1, 3, 2, 4, 5)
+        x = x.reshape(batch, rows * s, rows * s, self.features)
+        missing = max(0, self.size - rows * s)
+        x = jnp.pad(x, [(0, 0)] + [(0, missing)] * 2 + [(0, 0)])
+        return x[:, : self.size, : self.size] + bias
+
+
+class NoisyDense(nn.Module):
+    """A linear layer with factorised Gaussian noise on its weights (Fortunato et al. 2018, section 3).
+
+    `y = x (mu + sigma * f(e_in) f(e_out)^T) + mu_b + sigma_b * f(e_out)`, with f(e) = sign(e) sqrt(|e|).
+    One draw serves the whole batch. Without a key the layer acts with its means.
+
+    Attributes:
+        features: outputs.
+        std: sigma starts as std / sqrt(inputs), the thesis' "noisy std".
+    """
+
+    features: int
+    std: float = 0.1
+
+    @nn.compact
+    def __call__(self, x: Array, key: Array | None) -> Array:
+        inputs = x.shape[-1]
+        init = uniform_fan_in(inputs)
+        sigma = nn.initializers.constant(self.std / math.sqrt(inputs))
+        kernel = self.param("kernel", init, (inputs, self.features))
+        bias = self.param("bias", init, (self.features,))
+        kernel_sigma = self.param("kernel_sigma", sigma, (inputs, self.features))
+        bias_sigma = self.param("bias_sigma", sigma, (self.features,))
+        if key is None:
+            return x @ kernel + bias
+        noise = jax.random.normal(key, (inputs + self.features,))
+        noise = jnp.sign(noise) * jnp.sqrt(jnp.abs(noise))
+        noise_in, noise_out = noise[:inputs], noise[inputs:]
+        kernel = kernel + kernel_sigma * (noise_in[:, None] * noise_out[None, :])
+        return x @ kernel + (bias + bias_sigma * noise_out)
+
+
+def _valid_conv(x: Array, kernel: Array, stride: int) -> Array:
+    return jax.lax.conv_general_dilated(
+        x, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+    )

@@ -1,0 +1,364 @@
+"""The host loop: act, step, add, sample, update; evaluate, log, checkpoint.
+
+Apart from `checkpoint`, this is the only file that moves data between numpy and the device. The device
+updates while the environments step: an update is handed its window before the step and its priorities are
+fetched after it, always in this order, so that no result depends on timing.
+"""
+
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from srl_jax import checkpoint, envs
+from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for
+from srl_jax.agent import Agent, make_agent
+from srl_jax.config import Config
+from srl_jax.evaluate import evaluate
+from srl_jax.metrics import MetricsWriter
+from srl_jax.optim import RL
+from srl_jax.progress import Progress
+from srl_jax.replay import Replay
+from srl_jax.types import TrainState, Window
+from srl_jax.update import make_latents, named_key
+
+PICTURES = 6
+"""Examples in the picture of what an objective learnt."""
+
+
+class Result(NamedTuple):
+    """How a run ended.
+
+    Attributes:
+        env_steps, updates: done.
+        interrupted: whether Ctrl-C ended it; all files are in order all the same.
+        pictures: {objective: (inputs, targets, outputs)}, float32 [B, H, W, S] each, of objectives that
+            have one.
+    """
+
+    env_steps: int
+    updates: int
+    interrupted: bool
+    pictures: dict[str, tuple]
+
+
+def train(config: Config, out: str | Path, *, progress: bool = True) -> Result:
+    """Trains one agent, writing `metrics.jsonl` and `checkpoints/` into a run directory that exists.
+
+    Args:
+        config: of the run, resolved.
+        out: the run directory.
+        progress: whether to draw a progress bar on stderr.
+
+    Raises:
+        srl_jax.specs.ConfigError: a spec or a checkpoint to start from does not fit.
+    """
+    return _Run(config, Path(out), progress).train()
+
+
+def greedy_policy(agent: Agent, params: Any, key: jax.Array, *, noisy: bool = False) -> Policy:
+    """The epsilon-greedy policy of an agent's parameters, as a function of numpy arrays."""
+    act = agent.act if noisy else agent.act_eval
+
+    def policy(frames: np.ndarray, step: int, epsilon: float) -> np.ndarray:
+        encoder, head = params["encoder"], params["heads"][RL]
+        return np.asarray(act(encoder, head, frames, key, np.int32(step), np.float32(epsilon)))
+
+    return policy
+
+
+def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
+    """An agent, its parameters and the manifest of a checkpoint or of a run's newest one.
+
+    Raises:
+        srl_jax.specs.ConfigError: there is none, it is damaged, or does not fit this code.
+    """
+    manifest = checkpoint.read_manifest(path)
+    agent = make_agent(manifest.config, manifest.num_actions)
+    template = jax.eval_shape(lambda key: agent.init(key).params, jax.random.key(0))
+    params = checkpoint.load_into(template, checkpoint.load(manifest), str(manifest.path))
+    return agent, params, manifest
+
+
+class _Run:
+    """One training run; its attributes are everything that changes while it runs."""
+
+    def __init__(self, config: Config, out: Path, progress: bool):
+        self.config, self.out = config, out
+        self.env = self.make_env("train", config.num_envs)
+        self.num_actions = int(self.env.single_action_space.n)
+        self.agent = make_agent(config, self.num_actions)
+        self.key = jax.random.key(config.seed)
+        self.state = self.agent.init(self.key, self.initial_encoder())
+        self.replay = Replay(
+            capacity=config.buffer_size,
+            num_streams=config.num_envs,
+            frame_shape=self.env.single_observation_space.shape,
+            stack=config.frame_stack,
+            horizon=self.agent.horizon,
+            gamma=config.gamma,
+            alpha=self.agent.algorithm.alpha if self.agent.mode.rl else 0.0,
+            seed=seed_for(config.seed, "replay"),
+        )
+        self.random = random_policy(self.num_actions, seed_for(config.seed, "random policy"))
+        self.given = self.given_policy() if config.policy_from else None
+        self.act_key = named_key(self.key, "act")
+        self.eval_key = named_key(self.key, "eval")
+        self.eval_env = None
+        self.env_steps = self.updates = 0
+        self.pending: deque[tuple[np.ndarray, jax.Array]] = deque()
+        self.log: list[dict] = []  # metrics of the updates since the last row, still on the device
+        self.returns: list[float] = []  # of the training episodes that ended since the last row
+        self.evaluation = float("nan")
+        self.start = time.perf_counter()
+        self.progress = Progress(config.steps, stream=None if progress else _Nowhere())
+        self.last_row = (0.0, 0)
+
+    def train(self) -> Result:
+        """Runs to the end, or to Ctrl-C."""
+        config = self.config
+        interrupted = False
+        events = self.out / "tensorboard" if config.tensorboard else None
+        with MetricsWriter(self.out / "metrics.jsonl", events) as self.writer, self.progress:
+            try:
+                self.run()
+            except KeyboardInterrupt:
+                interrupted = True
+                self.progress.note(f"interrupted after {self.env_steps} env steps; saving")
+            self.finish_updates()
+            self.save()
+            pictures = self.pictures()
+            self.env.close()
+            if self.eval_env is not None:
+                self.eval_env.close()
+        return Result(self.env_steps, self.updates, interrupted, pictures)
+
+    def run(self) -> None:
+        """The loop proper."""
+        config = self.config
+        number = config.num_envs
+        frames, _ = self.env.reset()
+        stacks = FrameStack(number, config.frame_stack, frames.shape[1:])
+        stacks.begin(frames)
+        self.replay.begin(frames)
+        score = np.zeros(number)
+        if self.evaluates(0):
+            return
+        while self.env_steps < config.steps:
+            actions = self.act(stacks.observations())
+            for _ in range(self.due()):
+                self.finish_updates()
+                self.launch_update()
+            frames, rewards, terminated, truncated, info = self.env.step(actions)
+            score += rewards
+            stacks.push(frames)
+            self.finish_updates()
+            self.replay.add(
+                actions,
+                (np.sign(rewards) if config.reward_clip else rewards).astype(np.float32),
+                terminated,
+                truncated,
+                info["life_lost"] if config.life_loss else np.zeros(number, bool),
+                frames,
+            )
+            before, self.env_steps = self.env_steps, self.env_steps + number
+            over = terminated | truncated
+            if over.any():
+                self.returns += score[over].tolist()
+                score[over] = 0.0
+                frames, _ = self.env.reset(options={"reset_mask": over})
+                stacks.begin(frames, over)
+                self.replay.begin(frames[over], np.flatnonzero(over))
+            if self.passed(before, config.log_every):
+                self.write_train_row()
+            if self.passed(before, config.eval_every) and self.evaluates(self.env_steps):
+                return
+            if self.passed(before, config.checkpoint_every or config.eval_every):
+                self.save()
+            self.progress.update(self.env_steps)
+
+    # Acting
+
+    def act(self, observations: np.ndarray) -> np.ndarray:
+        """The behaviour policy's actions, int32 [N]."""
+        config = self.config
+        if self.agent.mode.rl:
+            policy = greedy_policy(self.agent, self.state.params, self.act_key, noisy=True)
+            return policy(observations, self.env_steps, self.epsilon)
+        if self.given is not None:
+            return self.given(observations, self.env_steps, config.pretrain_epsilon)
+        return self.random(observations, self.env_steps, 1.0)
+
+    @property
+    def epsilon(self) -> float:
+        """Of the training policy, now."""
+        c = self.config
+        if not self.agent.mode.rl:
+            return c.pretrain_epsilon if self.given is not None else 1.0
+        return linear(c.eps_train, c.eps_final, c.eps_anneal_steps, self.env_steps)
+
+    @property
+    def beta(self) -> float:
+        """The importance weights' exponent, now."""
+        c = self.config
+        return linear(c.beta, c.beta_final, c.beta_anneal_steps, self.env_steps)
+
+    # Learning
+
+    def due(self) -> int:
+        """Updates to do now, so that there are `updates_per_step` for each env step since learning began."""
+        config = self.config
+        if self.env_steps < config.learn_start or not len(self.replay):
+            return 0
+        # Counted from the start of learning; the first comes with the first step after it.
+        steps = self.env_steps - config.learn_start + config.num_envs
+        return int(steps * config.updates_per_step + 1e-9) - self.updates
+
+    def launch_update(self) -> None:
+        """Hands the device a window; does not wait."""
+        window, indices = self.replay.sample(self.config.batch_size, self.beta)
+        self.state, td_error, metrics = self.agent.update(self.state, window, self.agent.hyper)
+        self.updates += 1
+        self.log.append(metrics)
+        self.pending.append((indices, td_error))
+
+    def finish_updates(self) -> None:
+        """Waits for the priorities of what was launched."""
+        while self.pending:
+            indices, td_error = self.pending.popleft()
+            if td_error is not None:
+                self.replay.set_priorities(indices, np.asarray(td_error))
+
+    # Reporting
+
+    def passed(self, before: int, every: int) -> bool:
+        """Whether a multiple of `every` env steps was reached since `before`."""
+        return self.env_steps // every > before // every
+
+    def write_train_row(self) -> None:
+        """A "train" row: means over the updates and episodes since the last one."""
+        now = time.perf_counter() - self.start
+        wall, steps = self.last_row
+        values = {
+            "epsilon": self.epsilon,
+            "beta": self.beta,
+            "replay/transitions": len(self.replay),
+            "train/episodes": len(self.returns),
+            "train/return_mean": float(np.mean(self.returns)) if self.returns else None,
+            "wall_steps_per_s": (self.env_steps - steps) / max(now - wall, 1e-9),
+        }
+        log = jax.device_get(self.log)
+        for name in log[0] if log else ():
+            values[name] = np.float32(np.mean([row[name] for row in log], dtype=np.float64))
+        self.writer.write("train", self.env_steps, self.updates, now, values)
+        shown = {n.removeprefix("loss/"): v for n, v in values.items() if n.startswith("loss/")}
+        shown.pop("total", None)
+        if self.returns:
+            shown["return"] = values["train/return_mean"]
+        self.progress.update(self.env_steps, **shown)
+        self.last_row = (now, self.env_steps)
+        self.log, self.returns = [], []
+
+    def evaluates(self, env_steps: int) -> bool:
+        """Evaluates and writes an "eval" row, where the mode has a policy; whether the run may stop now."""
+        config = self.config
+        if not self.agent.mode.rl:
+            return False
+        if self.eval_env is None:
+            self.eval_env = self.make_env("eval", min(config.num_envs, config.eval_games))
+        began = time.perf_counter()
+        played = evaluate(
+            greedy_policy(self.agent, self.state.params, self.eval_key),
+            self.eval_env,
+            games=config.eval_games,
+            seed=seed_for(config.seed, "eval", env_steps),
+            epsilon=config.eps_eval,
+            stack=config.frame_stack,
+            max_steps=config.eval_max_steps,
+        )
+        self.evaluation = float(np.mean(played.returns))
+        values = {
+            "eval/return_mean": self.evaluation,
+            "eval/returns": played.returns,
+            "eval/lengths": played.lengths,
+            "wall_eval_s": round(time.perf_counter() - began, 3),
+        }
+        self.writer.write("eval", env_steps, self.updates, time.perf_counter() - self.start, values)
+        self.progress.note(
+            f"evaluation after {env_steps} env steps: mean return {self.evaluation:.2f} "
+            f"over {len(played.returns)} games, {values['wall_eval_s']:.1f} s"
+        )
+        self.progress.update(env_steps, evaluation=self.evaluation)
+        return config.stop_at_return is not None and self.evaluation >= config.stop_at_return
+
+    def save(self) -> None:
+        """Writes a checkpoint."""
+        checkpoint.save(
+            self.out,
+            self.state.params,
+            self.config,
+            num_actions=self.num_actions,
+            env_steps=self.env_steps,
+            updates=self.updates,
+        )
+
+    def pictures(self) -> dict[str, tuple]:
+        """What the objectives make of a few observations from replay."""
+        drawn = {n: o.image for n, o in self.agent.objectives.items() if o.image}
+        if not drawn or not len(self.replay):
+            return {}
+        window, _ = self.replay.sample(PICTURES, self.beta)
+
+        def draw(state: TrainState, window: Window):
+            encoder, encoder_params = self.agent.encoder, state.params["encoder"]
+            latents = make_latents(encoder, encoder_params, encoder_params, window)
+            heads = state.params["heads"]
+            return {name: image(heads[name], latents, window) for name, image in drawn.items()}
+
+        made = jax.device_get(jax.jit(draw)(self.state, window))
+        stack = self.config.frame_stack
+        inputs = np.moveaxis(window.frames[:, :stack], 1, -1).astype(np.float32) / 255.0
+        return {name: (inputs, target, output) for name, (target, output) in made.items()}
+
+    # Starting
+
+    def make_env(self, purpose: str, num_envs: int):
+        """Environments with seeds of their own for this purpose."""
+        config = self.config
+        return envs.make(
+            config.game,
+            num_envs=num_envs,
+            seed=seed_for(config.seed, purpose, "environments"),
+            frame_size=config.frame_size,
+            sticky_actions=config.sticky_actions,
+            noop_max=config.noop_max,
+        )
+
+    def initial_encoder(self) -> Any:
+        """Parameters that the encoder starts from, or None for scratch."""
+        if not self.config.encoder_from:
+            return None
+        manifest = checkpoint.read_manifest(self.config.encoder_from)
+        template = jax.eval_shape(self.agent.encoder.init, self.key)
+        tree = checkpoint.load(manifest)["encoder"]
+        return checkpoint.load_into(template, tree, f"--encoder_from={self.config.encoder_from}")
+
+    def given_policy(self) -> Policy:
+        """The policy of `policy_from`, without noise."""
+        agent, params, manifest = load_agent(self.config.policy_from)
+        if manifest.num_actions != self.num_actions:
+            raise ValueError("the policy is for another number of actions")
+        return greedy_policy(agent, params, named_key(self.key, "given policy"))
+
+
+class _Nowhere:
+    """A stream that takes everything and shows nothing."""
+
+    def write(self, text: str) -> None:
+        pass
+
+    def flush(self) -> None:
+        pass

@@ -1,0 +1,186 @@
+"""A run's numbers on disk: metrics.jsonl, and TensorBoard events beside it.
+
+Every key whose value depends on the clock begins with `wall_` (`wall_s`, `wall_steps_per_s`); every
+other value must be a function of the configuration and the seed. Two runs of the same seed on the
+same machine therefore have equal rows once `strip_wall` has been applied.
+"""
+
+import json
+import math
+import numbers
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+KINDS = ("train", "eval")
+LEADING = ("kind", "env_steps", "updates", "wall_s")
+"""The keys that every row begins with, in this order; the rest follow sorted."""
+
+
+class MetricsWriter:
+    """Appends rows to a file of JSON objects, one a line, each flushed as it is written.
+
+    An existing file is continued. What a killed process left of its last line is removed first, so
+    that the next row does not run into it.
+
+    Numbers are written so that they read back as they were: float32 by the shortest decimal that
+    gives the same float32, float64 likewise. JSON has no NaN and no infinity: all three of NaN, inf
+    and -inf are written as null, which `np.array(values, float)` reads as NaN.
+
+    Args:
+        path: the file, made if it does not exist; its directory must exist.
+        tensorboard_dir: where to write TensorBoard events too, or None. Scalars only, under the
+            same keys, with env_steps as the step.
+
+    Raises:
+        ImportError: if `tensorboard_dir` is given and tensorboardX is not installed.
+    """
+
+    def __init__(self, path: str | os.PathLike, tensorboard_dir: str | os.PathLike | None = None):
+        self._events = None
+        if tensorboard_dir is not None:
+            try:
+                from tensorboardX import SummaryWriter
+            except ImportError as error:
+                raise ImportError(
+                    "TensorBoard events need tensorboardX: pip install srl-jax[tensorboard]"
+                ) from error
+            self._events = SummaryWriter(str(tensorboard_dir))
+        _mend(Path(path))
+        self._file = open(path, "a", encoding="utf-8", newline="\n")
+
+    def write(
+        self, kind: str, env_steps: int, updates: int, wall_s: float, values: Mapping[str, Any]
+    ) -> None:
+        """Writes one row.
+
+        Args:
+            kind: "train" or "eval".
+            env_steps: agent decisions so far, over all environments.
+            updates: gradient updates so far.
+            wall_s: seconds since the run began, written to the millisecond.
+            values: key -> a number, bool, string, None, or an array or sequence of those. Device
+                arrays are fetched here: this is where the host waits for them.
+
+        Raises:
+            ValueError: for another kind, or a value under one of the leading keys.
+            TypeError: for a value of another type.
+        """
+        if kind not in KINDS:
+            raise ValueError(f"kind is {kind!r}; valid: {', '.join(KINDS)}")
+        if clash := sorted(set(values) & set(LEADING)):
+            raise ValueError(f"values may not hold the leading keys {', '.join(clash)}")
+        rest = {key: _plain(key, values[key]) for key in sorted(values)}
+        row = {
+            "kind": kind,
+            "env_steps": int(env_steps),
+            "updates": int(updates),
+            "wall_s": round(float(wall_s), 3),
+            **rest,
+        }
+        self._file.write(json.dumps(row, allow_nan=False) + "\n")
+        self._file.flush()
+        if self._events is not None:
+            for key, value in rest.items():
+                if isinstance(value, int | float):
+                    self._events.add_scalar(key, value, row["env_steps"])
+            self._events.flush()
+
+    def close(self) -> None:
+        """Closes the files. A second call does nothing."""
+        self._file.close()
+        if self._events is not None:
+            self._events.close()
+            self._events = None
+
+    def __enter__(self) -> "MetricsWriter":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
+    """Reads a metrics.jsonl, also one that is still being written.
+
+    A last line that is cut short (the writer was killed, or is in the middle of it) is left out.
+
+    Returns:
+        The rows in the order of the file; null is None.
+
+    Raises:
+        ValueError: if any other line is not a JSON object, naming the file and the line.
+    """
+    lines = Path(path).read_bytes().split(b"\n")
+    rows = []
+    for number, line in enumerate(lines, 1):
+        try:
+            if number < len(lines) or line:
+                rows.append(_parse(line))
+        except ValueError as error:
+            if number < len(lines):
+                raise ValueError(f"{path}, line {number}: {error}") from None
+    return rows
+
+
+def strip_wall(row: Mapping[str, Any]) -> dict[str, Any]:
+    """The row without its `wall_` keys: the part that a seed must reproduce."""
+    return {key: value for key, value in row.items() if not key.startswith("wall_")}
+
+
+def _parse(line: bytes) -> dict[str, Any]:
+    def refuse(name):
+        raise ValueError(f"{name} is not JSON")
+
+    row = json.loads(line.decode("utf-8"), parse_constant=refuse)
+    if not isinstance(row, dict):
+        raise ValueError("not a JSON object")
+    return row
+
+
+def _mend(path: Path) -> None:
+    """Ends the file with a whole line: completes the last one if only its newline is missing."""
+    if not path.exists():
+        return
+    with open(path, "r+b") as file:
+        data = file.read()
+        whole = data.rfind(b"\n") + 1
+        if whole == len(data):
+            return
+        try:
+            _parse(data[whole:])
+            file.write(b"\n")
+        except ValueError:
+            file.truncate(whole)
+
+
+def _plain(key: str, value: Any) -> Any:
+    """The value in Python's own types, floats finite or None."""
+    if value is None or isinstance(value, str | bool):
+        return value
+    if isinstance(value, numbers.Integral):
+        return int(value)
+    if isinstance(value, float) and not isinstance(value, np.generic):
+        return value if math.isfinite(value) else None
+    if isinstance(value, list | tuple):
+        return [_plain(key, item) for item in value]
+    array = np.asarray(value)
+    if array.ndim:
+        return [_plain(key, item) for item in array]
+    if array.dtype == np.bool_:
+        return bool(array)
+    if np.issubdtype(array.dtype, np.integer):
+        return int(array)
+    if array.dtype == np.float64:
+        return _plain(key, float(array))
+    try:
+        if array.dtype.kind == "c":
+            raise TypeError
+        # numpy prints the shortest decimal that gives back the same float32; the nearest double to
+        # it prints the same. Narrower floats fit in a float32.
+        return _plain(key, float(str(array.astype(np.float32)[()])))
+    except (TypeError, ValueError):
+        raise TypeError(f"{key}: cannot write a value of type {type(value).__name__}") from None

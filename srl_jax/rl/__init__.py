@@ -1,0 +1,130 @@
+"""The RL algorithms: `REGISTRY[name](context, **options) -> Algorithm`; rows are Rainbow less some parts."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from srl_jax.rl.heads import QNetwork
+from srl_jax.rl.losses import categorical_q_learning, huber, q_learning
+from srl_jax.rl.losses import n_step as n_step_view
+from srl_jax.types import Context, Latents, Objective, Window
+
+__all__ = ["REGISTRY", "Algorithm", "rainbow"]
+
+
+class Algorithm(NamedTuple):
+    """An RL algorithm: its term of the loss, how it values actions, and what it asks of replay.
+
+    Attributes:
+        objective: the loss; its metrics are `td_error` float32 [B] (what priorities are made of) and
+            `q_max_mean`, a scalar: the mean over the batch of the largest value of s_t.
+        q_values: (head, latents [B, D], key | None) -> float32 [B, A]; without a key, without noise.
+        alpha: the priority exponent; 0 where replay is uniform.
+    """
+
+    objective: Objective
+    q_values: Callable
+    alpha: float
+
+
+def rainbow(
+    context: Context,
+    *,
+    distributional: bool = True,
+    double: bool = True,
+    dueling: bool = True,
+    noisy: bool = True,
+    prioritized: bool = True,
+    n_step: int = 3,
+    atoms: int = 51,
+    v_min: float = -10.0,
+    v_max: float = 10.0,
+    noisy_std: float = 0.1,
+    alpha: float = 0.5,
+    hidden: int = 512,
+) -> Algorithm:
+    """Rainbow (Hessel et al. 2018), each part of which can be left out alone.
+
+    Args:
+        context: the encoder below and the number of actions.
+        distributional: C51 over `atoms` returns in [v_min, v_max]; otherwise Huber loss on Q values.
+        double: the online network picks the action that the slow one evaluates.
+        dueling: a stream of state values beside the actions' own.
+        noisy: noisy linear layers, sigma starting at noisy_std / sqrt(inputs).
+        prioritized: replay by priority, `|td_error| ** alpha`; otherwise uniform.
+        n_step: steps of reward before bootstrapping.
+        atoms, v_min, v_max: the value distribution's support, in units of (discounted) reward.
+        noisy_std: see `srl_jax.layers.NoisyDense`.
+        alpha: the priority exponent (Schaul et al. 2016).
+        hidden: width of each stream's hidden layer.
+
+    Raises:
+        ValueError: where n_step or hidden is 0, atoms is below 2, or v_min is not below v_max.
+    """
+    if n_step < 1:
+        raise ValueError("n_step must be at least 1")
+    if hidden < 1:
+        raise ValueError("hidden must be at least 1")
+    if distributional and atoms < 2:
+        raise ValueError("atoms must be at least 2")
+    if distributional and v_min >= v_max:
+        raise ValueError(f"v_min must be below v_max, not {v_min} and {v_max}")
+    network = QNetwork(context.num_actions, atoms if distributional else 1, hidden, dueling, noisy, noisy_std)
+    support = np.linspace(v_min, v_max, atoms, dtype=np.float32) if distributional else None
+
+    def init(key):
+        return network.init(key, jnp.zeros((1, context.encoder.features)), None)["params"]
+
+    def expected(output):  # [B, A, M] -> [B, A]
+        if distributional:
+            return jax.nn.softmax(output) @ support
+        return output[..., 0]
+
+    def q_values(head, latents, key=None):
+        return expected(network.apply({"params": head}, latents, key))
+
+    def loss(head, slow_head, latents: Latents, window: Window, key):
+        r_t, discount_t, offset = n_step_view(window.rewards, window.discounts, window.valid, n_step)
+        a_tm1 = window.actions[:, 0]
+        key_tm1, key_selector, key_slow = jax.random.split(key, 3)
+        out_tm1 = network.apply({"params": head}, latents.online(0), key_tm1)
+        slow_t = network.apply({"params": slow_head}, latents.slow(offset), key_slow)
+        slow_t = jax.lax.stop_gradient(slow_t)
+        if double:
+            z_t = jax.lax.stop_gradient(latents.online(offset))
+            frozen = jax.lax.stop_gradient(head)
+            selector_t = expected(network.apply({"params": frozen}, z_t, key_selector))
+        else:
+            selector_t = expected(slow_t)
+        if distributional:
+            losses = jax.vmap(categorical_q_learning, (0, None, 0, 0, 0, 0, 0))(
+                out_tm1, support, a_tm1, r_t, discount_t, slow_t, selector_t
+            )
+            td_error = losses
+        else:
+            td_error = jax.vmap(q_learning)(
+                out_tm1[..., 0], a_tm1, r_t, discount_t, slow_t[..., 0], selector_t
+            )
+            losses = huber(td_error)
+        metrics = {"td_error": td_error, "q_max_mean": jnp.mean(jnp.max(expected(out_tm1), -1))}
+        # Importance weights correct the RL loss alone, so it is the RL loss that multiplies them.
+        return losses * window.weight, jax.lax.stop_gradient(metrics)
+
+    return Algorithm(
+        objective=Objective(init, loss, horizon=n_step),
+        q_values=q_values,
+        alpha=alpha if prioritized else 0.0,
+    )
+
+
+_plain = partial(rainbow, double=False, dueling=False, noisy=False, prioritized=False, n_step=1)
+REGISTRY = {
+    "rainbow": rainbow,
+    "c51": _plain,
+    "double": partial(_plain, distributional=False, double=True),
+    "dqn": partial(_plain, distributional=False),
+}

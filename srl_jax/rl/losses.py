@@ -1,0 +1,124 @@
+"""Reinforcement-learning losses, each for one example: `jax.vmap` them over a batch.
+
+They take arrays and give arrays, know nothing of networks, replay or `done`, and can be imported by another
+project. A time index is `_tm1` for s_t and `_t` for the state bootstrapped from; `slow` is a lagged copy.
+"""
+
+import chex
+import jax
+import jax.numpy as jnp
+
+from srl_jax.types import Array
+
+
+def q_learning(
+    q_tm1: Array, a_tm1: Array, r_t: Array, discount_t: Array, q_slow_t: Array, q_selector_t: Array
+) -> Array:
+    """The temporal-difference error of (double) Q-learning.
+
+    `r + discount * q_slow[argmax q_selector] - q_tm1[a]`. With the slow network's own values as selector
+    it is the target of DQN (Mnih et al. 2015); with the online network's, that of double DQN (van Hasselt
+    et al. 2016, equation 4).
+
+    Args:
+        q_tm1: float32 [A], online values of s_t.
+        a_tm1: int32 [], the action taken there.
+        r_t: float32 [], the (n-step) return up to the state bootstrapped from.
+        discount_t: float32 [], that state's discount; 0 where terminal.
+        q_slow_t: float32 [A], slow values of that state.
+        q_selector_t: float32 [A], the values whose greedy action is evaluated.
+
+    Returns:
+        float32 [], in units of reward. The gradient flows into q_tm1 alone.
+    """
+    chex.assert_rank([q_tm1, a_tm1, r_t, discount_t, q_slow_t, q_selector_t], [1, 0, 0, 0, 1, 1])
+    chex.assert_type([q_tm1, a_tm1], [float, int])
+    target = jax.lax.stop_gradient(r_t + discount_t * q_slow_t[jnp.argmax(q_selector_t)])
+    return target - q_tm1[a_tm1]
+
+
+def huber(td_error: Array, delta: float = 1.0) -> Array:
+    """The Huber loss of a temporal-difference error: quadratic within delta, linear beyond (any shape)."""
+    size = jnp.abs(td_error)
+    quadratic = jnp.minimum(size, delta)
+    return 0.5 * quadratic**2 + delta * (size - quadratic)
+
+
+def categorical_q_learning(
+    q_logits_tm1: Array,
+    atoms: Array,
+    a_tm1: Array,
+    r_t: Array,
+    discount_t: Array,
+    q_logits_slow_t: Array,
+    q_selector_t: Array,
+) -> Array:
+    """The cross-entropy of categorical (double) Q-learning, C51.
+
+    The slow distribution of the selected action is shifted and scaled by the return and the discount,
+    projected on the atoms, and compared with the online distribution of the action taken (Bellemare et al.
+    2017, algorithm 1; with the online network as selector, Rainbow's: Hessel et al. 2018, section 3).
+
+    Args:
+        q_logits_tm1: float32 [A, M], online logits of s_t.
+        atoms: float32 [M], evenly spaced and ascending returns.
+        a_tm1: int32 [], the action taken in s_t.
+        r_t: float32 [], the (n-step) return up to the state bootstrapped from.
+        discount_t: float32 [], that state's discount; 0 where terminal.
+        q_logits_slow_t: float32 [A, M], slow logits of that state.
+        q_selector_t: float32 [A], the expected values whose greedy action is evaluated.
+
+    Returns:
+        float32 [], in nats. The gradient flows into q_logits_tm1 alone.
+    """
+    chex.assert_rank(
+        [q_logits_tm1, atoms, a_tm1, r_t, discount_t, q_logits_slow_t, q_selector_t],
+        [2, 1, 0, 0, 0, 2, 1],
+    )
+    chex.assert_type([q_logits_tm1, a_tm1], [float, int])
+    probs_t = jax.nn.softmax(q_logits_slow_t[jnp.argmax(q_selector_t)])
+    target = categorical_projection(r_t + discount_t * atoms, probs_t, atoms)
+    target = jax.lax.stop_gradient(target)
+    return -jnp.sum(target * jax.nn.log_softmax(q_logits_tm1[a_tm1]))
+
+
+def categorical_projection(support: Array, probs: Array, atoms: Array) -> Array:
+    """Moves a distribution onto other atoms, each mass split between its two neighbours by distance.
+
+    Args:
+        support: float32 [L], where the masses are; beyond the atoms they go to the nearest end.
+        probs: float32 [L], the masses.
+        atoms: float32 [M], evenly spaced and ascending.
+
+    Returns:
+        float32 [M], of the same sum as probs (Bellemare et al. 2017, equation 7).
+    """
+    chex.assert_rank([support, probs, atoms], 1)
+    spacing = (atoms[-1] - atoms[0]) / (atoms.shape[0] - 1)
+    support = jnp.clip(support, atoms[0], atoms[-1])
+    distance = jnp.abs(support[None, :] - atoms[:, None]) / spacing
+    return jnp.clip(1.0 - distance, 0.0, 1.0) @ probs
+
+
+def n_step(rewards: Array, discounts: Array, valid: Array, n: int):
+    """The n-step view of a window: what the return is, and where and with what discount to bootstrap.
+
+    Sums rewards until n steps are done, a discount is 0 (a terminal state) or the episode is over. After a
+    truncation it bootstraps from the episode's final observation, fewer than n steps ahead (Sutton & Barto
+    2018, equation 7.1; Pardo et al. 2018 on time limits).
+
+    Args:
+        rewards, discounts, valid: float32 [..., K], as in `srl_jax.types.Window`, with K >= n.
+        n: steps.
+
+    Returns:
+        r_t: float32 [...], the discounted sum of rewards.
+        discount_t: float32 [...], the product of the discounts; 0 where a terminal state was met.
+        offset: int32 [...], where to bootstrap from, 1..n steps after s_t.
+    """
+    r_t = jnp.zeros(rewards.shape[:-1])
+    discount_t = jnp.ones(rewards.shape[:-1])
+    for k in range(n):
+        r_t = r_t + valid[..., k] * discount_t * rewards[..., k]
+        discount_t = discount_t * jnp.where(valid[..., k] > 0, discounts[..., k], 1.0)
+    return r_t, discount_t, jnp.sum(valid[..., :n], -1).astype(jnp.int32)

@@ -1,0 +1,268 @@
+"""One syntax, `name:key=value,key=value`, for the rows of a registry. Nothing here imports jax.
+
+A registry is a dict from a name to a factory: a function, or a functools.partial of one. The
+factory's keyword-only parameters are the options, and their defaults give both the default and the
+type. So a new option needs no new flag, and a typo is an error that lists what there is.
+"""
+
+import dataclasses
+import difflib
+import inspect
+import math
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be run; one line that names the flag and the valid choices."""
+
+
+class SpecError(ConfigError):
+    """A specification, `name:key=value,...`, that cannot be read or built."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Spec:
+    """A row of a registry with its options.
+
+    Attributes:
+        name: the row.
+        options: the options that were given, by name, of their default's type.
+        resolved: every option of the row, the defaults included, in the factory's order.
+        flag: where it came from, without dashes; names the flag in errors. May be empty.
+    """
+
+    name: str
+    options: Mapping[str, Any]
+    resolved: Mapping[str, Any]
+    flag: str = dataclasses.field(default="", compare=False)
+
+    def __str__(self) -> str:
+        """The given options in the factory's order; parsing it gives this Spec again."""
+        return join(self.name, self.options)
+
+    @property
+    def full(self) -> str:
+        """Like str, with every option: config.json keeps it, so no later default changes a run."""
+        return join(self.name, self.resolved)
+
+
+def choices_text(given: str, names: Iterable[str]) -> str:
+    """`did you mean X? valid: ...`; suggests only where a name is near (letter case aside)."""
+    names = list(names)
+    lowered = {name.lower(): name for name in names}
+    near = difflib.get_close_matches(given.lower(), lowered, n=1, cutoff=0.6)
+    suggestion = f"did you mean {lowered[near[0]]}? " if near else ""
+    return f"{suggestion}valid: {', '.join(names)}"
+
+
+def parse_value(text: str, kind: type) -> bool | int | float | str:
+    """Reads one value.
+
+    Args:
+        text: what was typed. Whole numbers may be written 1000000, 1_000_000 or 1e6.
+        kind: bool, int, float or str.
+
+    Returns:
+        The value; numbers are finite.
+
+    Raises:
+        ValueError: it is not of that kind. The message is a reason to follow the value.
+    """
+    if kind is str:
+        return text
+    wrong = ValueError(f"not {_KINDS[kind]}")
+    text = text.strip()
+    if kind is bool:
+        try:
+            return {"true": True, "1": True, "false": False, "0": False}[text.lower()]
+        except KeyError:
+            raise wrong from None
+    if kind is int:
+        try:
+            return int(text)
+        except ValueError:
+            pass  # 1e6 is a whole number too.
+    try:
+        number = float(text)
+    except ValueError:
+        raise wrong from None
+    if not math.isfinite(number):
+        raise ValueError("not a finite number")
+    if kind is int:
+        if number != int(number):
+            raise wrong
+        return int(number)
+    return number
+
+
+def value_text(value: bool | int | float | str) -> str:
+    """The inverse of `parse_value`, exact for floats."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    return repr(value) if isinstance(value, float) else str(value)
+
+
+class Info(NamedTuple):
+    """What a value may be.
+
+    Attributes:
+        kind: bool, int, float, str, or tuple (of str: a flag that may be repeated).
+        help: one line for --help.
+        unit: "env steps", say; empty where there is none.
+        minimum: the smallest value; None for no limit. Likewise `maximum`.
+        above: the value must be larger than this.
+        choices: the valid texts; empty for any.
+        optional: the value may be None, written "off".
+        flag: the flag's name where it is not the field's.
+    """
+
+    kind: type
+    help: str
+    unit: str = ""
+    minimum: float | None = None
+    maximum: float | None = None
+    above: float | None = None
+    choices: tuple[str, ...] = ()
+    optional: bool = False
+    flag: str = ""
+
+    def check(self, value: Any) -> None:
+        """Raises ValueError, a reason that follows the value, where the value is not allowed."""
+        if value is None and self.optional:
+            return
+        if self.choices and value not in self.choices:
+            raise ValueError(choices_text(str(value), self.choices))
+        unit = f" ({self.unit})" if self.unit else ""
+        if self.minimum is not None and not value >= self.minimum:
+            raise ValueError(f"must be at least {self.minimum:g}{unit}")
+        if self.above is not None and not value > self.above:
+            raise ValueError(f"must be above {self.above:g}{unit}")
+        if self.maximum is not None and not value <= self.maximum:
+            raise ValueError(f"must be at most {self.maximum:.10g}{unit}")
+
+    def parse(self, text: str) -> Any:
+        """The value of a text, checked; of one element's text where the kind is tuple.
+
+        Raises:
+            ValueError: a reason that follows the text.
+        """
+        if self.optional and text.strip().lower() in ("off", "none", "nan"):
+            return None
+        try:
+            value = parse_value(text, str if self.kind is tuple else self.kind)
+        except ValueError as error:
+            unit = f" ({self.unit})" if self.unit else ""
+            raise ValueError(f"{error}{unit}") from None
+        self.check(value)
+        return value
+
+
+def split(text: str) -> tuple[str, dict[str, str]]:
+    """Cuts `name:key=value,...` into the name and the texts of its options; knows no registry.
+
+    Raises:
+        SpecError: no name, an option that is not key=value, or a key given twice.
+    """
+    name, colon, rest = text.strip().partition(":")
+    name = name.strip()
+    if not name:
+        raise SpecError("has no name; write name or name:key=value,key=value")
+    options: dict[str, str] = {}
+    for part in rest.split(",") if colon else ():
+        key, equals, value = part.partition("=")
+        key = key.strip()
+        if not equals or not key:
+            raise SpecError(f"{part.strip()!r} is not key=value; write name:key=value,key=value")
+        if key in options:
+            raise SpecError(f"{key} is given twice")
+        options[key] = value.strip()
+    return name, options
+
+
+def join(name: str, options: Mapping[str, Any]) -> str:
+    """The inverse of `split`, for values of any kind."""
+    if not options:
+        return name
+    return name + ":" + ",".join(f"{key}={value_text(value)}" for key, value in options.items())
+
+
+def option_defaults(factory: Callable) -> dict[str, Any]:
+    """The options of a factory: its keyword-only parameters with their defaults, in order.
+
+    Raises:
+        TypeError: a keyword-only parameter whose default is not a bool, int, float or str.
+    """
+    defaults = {}
+    for parameter in inspect.signature(factory).parameters.values():
+        if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
+            if type(parameter.default) not in _KINDS:
+                raise TypeError(f"{factory}: {parameter.name} needs a bool, int, float or str default")
+            defaults[parameter.name] = parameter.default
+    return defaults
+
+
+def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
+    """Reads `name:key=value,...` against a registry.
+
+    Args:
+        text: the specification, for example `sac_ae:features=256`.
+        registry: name -> factory; its keyword-only parameters with defaults are the options.
+        flag: names the flag in errors, without dashes.
+
+    Returns:
+        The Spec. Options have their default's type; numbers are finite, and not negative unless the
+        default is.
+
+    Raises:
+        SpecError: unknown name or option, wrong type, out of range, or not the syntax; one line.
+    """
+    where = _where(flag, text)
+    try:
+        name, texts = split(text)
+    except SpecError as error:
+        raise SpecError(f"{where}: {error}") from None
+    if name not in registry:
+        raise SpecError(f"{where}: no {name!r}; {choices_text(name, registry)}")
+    defaults = option_defaults(registry[name])
+    options = {}
+    for key, value in texts.items():
+        if key not in defaults:
+            known = ", ".join(f"{k}={value_text(v)}" for k, v in defaults.items()) or "none"
+            near = difflib.get_close_matches(key, defaults, n=1, cutoff=0.6)
+            suggestion = f"did you mean {near[0]}? " if near else ""
+            raise SpecError(
+                f"{where}: {name} has no option {key!r}; {suggestion}options and defaults: {known}"
+            )
+        default = defaults[key]
+        try:
+            options[key] = parse_value(value, type(default))
+        except ValueError as error:
+            raise SpecError(f"{where}: {key}={value} is {error} (default {value_text(default)})") from None
+        is_number = type(default) in (int, float)
+        if is_number and options[key] < 0 <= default:
+            raise SpecError(f"{where}: {key}={value} must not be negative (default {value_text(default)})")
+    options = {key: options[key] for key in defaults if key in options}
+    return Spec(name, options, {**defaults, **options}, flag)
+
+
+def build(spec: Spec, registry: Mapping[str, Callable], *context: Any) -> Any:
+    """Calls the row's factory: `factory(*context, **spec.resolved)`.
+
+    Raises:
+        SpecError: the factory raised ValueError (two options that do not fit together, say).
+    """
+    try:
+        return registry[spec.name](*context, **spec.resolved)
+    except SpecError:
+        raise
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise SpecError(f"{_where(spec.flag, str(spec))}: {reason}") from error
+
+
+def _where(flag: str, text: str) -> str:
+    text = " ".join(text.split())
+    return f"--{flag}={text}" if flag else repr(text)

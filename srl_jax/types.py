@@ -1,0 +1,130 @@
+"""The nouns of the project: what moves between replay, update and the losses.
+
+Shapes use B for batch, S for stacked frames (4), K for the window's horizon, H and W for the frame's
+height and width, D for the latent's size. Nothing here imports jax, so that a command line can be
+checked without paying for it.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+Params = Any
+"""A tree of float32 arrays."""
+Array = Any
+"""A numpy or a jax array."""
+
+
+class Window(NamedTuple):
+    """B short stretches of experience: K + 1 observations' worth of single frames.
+
+    Offset k means the observation s_{t+k}; s_t is the one that was sampled. Observations are stacks of S
+    frames, and neighbours share S - 1 of them, so a window holds S + K frames, not S * (K + 1).
+
+    Frames never cross an episode: before the first frame of an episode the first frame is repeated,
+    after the last one the last one is repeated (those offsets have `valid` = 0).
+
+    Attributes:
+        frames: uint8 [B, S + K, H, W]; frame i belongs to time t - S + 1 + i.
+        actions: int32 [B, K]; `actions[:, k]` was taken in s_{t+k}. Zero where not valid.
+        rewards: float32 [B, K]; `rewards[:, k]` followed `actions[:, k]`, as learnt from (clipped or
+            not is the loop's choice). Zero where not valid.
+        discounts: float32 [B, K]; gamma, or 0 where s_{t+k+1} is terminal (game over, or a lost life
+            where the run counts that as terminal). No loss ever sees `done`. Zero where not valid.
+        valid: float32 [B, K]; 1 while s_{t+k+1} belongs to the same episode as s_t, then 0 for good.
+            The final observation of an episode belongs to it. `valid[:, 0]` is always 1.
+        weight: float32 [B]; importance weights, divided by the batch's maximum.
+    """
+
+    frames: Array
+    actions: Array
+    rewards: Array
+    discounts: Array
+    valid: Array
+    weight: Array
+
+
+class Encoder(NamedTuple):
+    """An encoder, as pure functions, and the recipe of the decoder that mirrors it.
+
+    Attributes:
+        init: key -> params.
+        apply: (params, uint8 [B, H, W, S]) -> float32 [B, D]; divides by 255 on entry. Images that are
+            already float32 in [0, 1] pass as they are.
+        features: D.
+        observation_shape: (H, W, S).
+        make_decoder: (extra_inputs: int = 0) -> Decoder; its input is the latent joined with that many
+            more numbers (a one-hot action, say).
+    """
+
+    init: Callable
+    apply: Callable
+    features: int
+    observation_shape: tuple
+    make_decoder: Callable
+
+
+class Decoder(NamedTuple):
+    """A decoder, as pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S]."""
+
+    init: Callable
+    apply: Callable
+
+
+class Context(NamedTuple):
+    """What a factory may know of the run that it is built for: the encoder and the number of actions."""
+
+    encoder: Encoder
+    num_actions: int
+
+
+class Latents(NamedTuple):
+    """The latents of a window's observations under the online and the slow encoder.
+
+    `online(k)` and `slow(k)` give float32 [B, D] for offset k, an int or an int32 array [B] (one offset
+    per row). The same offset is encoded at most once per trace, however many objectives ask for it.
+    """
+
+    online: Callable
+    slow: Callable
+
+
+class Objective(NamedTuple):
+    """One term of the loss, and the parameters that only it uses. Reinforcement learning is one too.
+
+    Attributes:
+        init: key -> head parameters (may be an empty dict).
+        loss: (head, slow_head, latents, window, key) -> (losses [B], metrics: dict of scalars, or of [B]
+            arrays for `td_error`).
+        weight: the factor of its batch mean in the summed loss.
+        horizon: how many steps after s_t it reads.
+        slow: how its head's slow copy follows, (new, old, step) -> slow; None if it has none.
+        is_decoder: the head is a decoder, which the optimizer's decoder weight decay applies to.
+        image: None, or (head, latents, window) -> (target, output), float32 [B, H, W, S] each, for the
+            picture that shows what it learnt.
+    """
+
+    init: Callable
+    loss: Callable
+    weight: float = 1.0
+    horizon: int = 0
+    slow: Callable | None = None
+    is_decoder: bool = False
+    image: Callable | None = None
+
+
+class TrainState(NamedTuple):
+    """Everything that an update changes.
+
+    Attributes:
+        params: {"encoder": tree, "heads": {name: tree}}.
+        slow: the lagged copies, of the same form; real copies, never the same buffers.
+        opt_state: the optimizer's, for the groups that move.
+        step: int32, updates done.
+        key: the run's key; update i uses fold_in(key, i), so it never changes.
+    """
+
+    params: Params
+    slow: Params
+    opt_state: Any
+    step: Array
+    key: Array

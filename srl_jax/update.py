@@ -1,0 +1,227 @@
+"""make_init, make_update and make_act: the one place where losses are summed."""
+
+import zlib
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from srl_jax.augment import random_shift
+from srl_jax.modes import Mode
+from srl_jax.optim import RL, Optimizer, real_copy
+from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
+from srl_jax.window import observation, stack_last
+
+
+class Hyper(NamedTuple):
+    """The numbers of an update that may change without compiling it again: traced float32 scalars.
+
+    Attributes:
+        weights: {objective: factor of its mean loss}.
+        learning_rates: {"encoder", "rl", "representation"}.
+    """
+
+    weights: dict[str, Array]
+    learning_rates: dict[str, Array]
+
+
+def named_key(key: Array, name: str) -> Array:
+    """A key that depends on a name alone, so that enabling one objective never changes another's noise."""
+    return jax.random.fold_in(key, zlib.crc32(name.encode()))
+
+
+def periodic(every: int) -> Callable:
+    """The rule of a slow copy that is replaced by the original every so many updates."""
+
+    def follow(new: Params, old: Params, step: Array) -> Params:
+        return jax.lax.cond(step % every == 0, lambda: new, lambda: old)
+
+    return follow
+
+
+def make_init(
+    encoder: Encoder,
+    objectives: dict[str, Objective],
+    mode: Mode,
+    optimizer: Optimizer,
+    *,
+    target_encoder: str = "slow",
+) -> Callable:
+    """init: (key, encoder_params | None) -> TrainState.
+
+    The encoder has a slow copy where an objective's head has one, unless `target_encoder` is "online".
+    `encoder_params`, where given, is where the encoder starts. Each tree's initial values depend on the key
+    and its own name alone.
+    """
+
+    def init(key: Array, encoder_params: Params | None = None) -> TrainState:
+        start = named_key(key, "init")
+        if encoder_params is None:
+            encoder_params = encoder.init(named_key(start, "encoder"))
+        heads = {n: o.init(named_key(start, f"head {n}")) for n, o in objectives.items()}
+        params = {"encoder": real_copy(encoder_params), "heads": heads}
+        slow = {"heads": {n: heads[n] for n, o in objectives.items() if o.slow}}
+        slow["encoder"] = params["encoder"] if slow["heads"] and target_encoder == "slow" else {}
+        trainable, _ = split(params, mode)
+        return TrainState(
+            params=params,
+            slow=real_copy(slow),
+            opt_state=optimizer.init(trainable),
+            step=jnp.zeros((), jnp.int32),
+            key=key,
+        )
+
+    return init
+
+
+def split(params: Params, mode: Mode) -> tuple[Params, Params]:
+    """The groups that move in a mode, and those that do not: two dicts that make up params together."""
+    moves = mode.rl_trains_encoder or mode.representation_trains_encoder
+    still = {} if moves else {"encoder": params["encoder"]}
+    return {group: tree for group, tree in params.items() if group not in still}, still
+
+
+def make_update(
+    encoder: Encoder,
+    objectives: dict[str, Objective],
+    mode: Mode,
+    optimizer: Optimizer,
+    *,
+    augment: str = "none",
+    target_encoder: str = "slow",
+) -> Callable:
+    """update: (TrainState, Window, Hyper) -> (TrainState, td_error [B] | None, metrics), pure; jit it once.
+
+    Sums `weight * mean(losses)` over the objectives, RL among them under the name "rl", takes one gradient
+    and one optimizer step. Objectives share the encoder's forward and backward pass: an offset is encoded
+    at most once for each view. Whether an objective's gradient enters the encoder is the mode's to say, and
+    is decided at the latent, so that nothing is differentiated for nothing.
+
+    Args:
+        encoder: the shared encoder.
+        objectives: by name; RL's is called "rl".
+        mode: a row of `srl_jax.modes`.
+        optimizer: from `srl_jax.optim`.
+        augment: "none"; "srl": the representation losses see a randomly shifted window; "all": every loss
+            does.
+        target_encoder: "slow": the slow latents come from the encoder's slow copy; "online": from the
+            online encoder, as in the thesis' code (without gradient either way).
+
+    Returns:
+        The update. Metrics are scalars on the device: `loss/NAME` (before its weight; RL's with its
+        importance weights), `loss/total`, `grad_norm`, `NAME/...` of each objective's own, `q_max`.
+    """
+
+    if augment not in ("none", "srl", "all"):
+        raise ValueError(f"augment must be none, srl or all, not {augment}")
+    if target_encoder not in ("slow", "online"):
+        raise ValueError(f"target_encoder must be slow or online, not {target_encoder}")
+
+    def update(state: TrainState, window: Window, hyper: Hyper):
+        if set(hyper.weights) != set(objectives):
+            raise ValueError(f"weights {sorted(hyper.weights)} for losses {sorted(objectives)}")
+        key = jax.random.fold_in(state.key, state.step)
+        shifted = window if augment == "none" else shift(window, named_key(key, "augment"))
+        rl_view = window if augment == "srl" else shifted
+        trainable, still = split(state.params, mode)
+
+        def summed(trainable: Params):
+            params = {**trainable, **still}
+            slow = state.slow["encoder"] if target_encoder == "slow" else params["encoder"]
+            seen = make_latents(encoder, params["encoder"], slow, shifted)
+            rl_seen = make_latents(encoder, params["encoder"], slow, rl_view)
+            if rl_view is shifted:
+                rl_seen = seen
+            losses, metrics = {}, {}
+            for name, objective in objectives.items():
+                view, latents, opens = shifted, seen, mode.representation_trains_encoder
+                if name == RL:
+                    view, latents, opens = rl_view, rl_seen, mode.rl_trains_encoder
+                losses[name], metrics[name] = objective.loss(
+                    params["heads"][name],
+                    state.slow["heads"].get(name),
+                    latents if opens else shut(latents),
+                    view,
+                    named_key(key, name),
+                )
+            total = sum(hyper.weights[name] * jnp.mean(losses[name]) for name in losses)
+            return total, (losses, metrics)
+
+        (total, (losses, extra)), grads = jax.value_and_grad(summed, has_aux=True)(trainable)
+        moved, opt_state, norm = optimizer.update(grads, state.opt_state, trainable, hyper.learning_rates)
+        params = {**moved, **still}
+        step = state.step + 1
+        td_error = extra.get(RL, {}).pop("td_error", None)
+        metrics = {f"loss/{name}": jnp.mean(x) for name, x in losses.items()}
+        metrics |= {"loss/total": total, "grad_norm": norm}
+        metrics |= {f"{name}/{k}": x for name, values in extra.items() for k, x in values.items()}
+        slow = follow(objectives, params, state.slow, step)
+        return TrainState(params, slow, opt_state, step, state.key), td_error, metrics
+
+    return update
+
+
+def follow(objectives: dict[str, Objective], params: Params, slow: Params, step: Array) -> Params:
+    """The slow copies after an update, each by its objective's rule; the encoder's goes with RL's."""
+    heads = {
+        name: objectives[name].slow(params["heads"][name], old, step) for name, old in slow["heads"].items()
+    }
+    encoder = slow["encoder"]
+    if RL in objectives and encoder:
+        encoder = objectives[RL].slow(params["encoder"], encoder, step)
+    return {"heads": heads, "encoder": encoder}
+
+
+def shift(window: Window, key: Array) -> Window:
+    """The window, each row shifted by its own draw."""
+    keys = jax.random.split(key, window.frames.shape[0])
+    return window._replace(frames=jax.vmap(random_shift)(window.frames, keys))
+
+
+def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window) -> Latents:
+    """Latents that encode an offset at most once for each object given as offset."""
+    known = {}
+
+    def at(which: str, tree: Params) -> Callable:
+        def latent(k: int | Array) -> Array:
+            index = (which, k if isinstance(k, int) else id(k))
+            if index not in known:  # the offset is kept too, so that its id stays its own
+                known[index] = (encoder.apply(tree, observation(window, k)), k)
+            return known[index][0]
+
+        return latent
+
+    frozen = at("slow", slow)
+    return Latents(at("online", params), lambda k: jax.lax.stop_gradient(frozen(k)))
+
+
+def shut(latents: Latents) -> Latents:
+    """The same latents without gradient: an objective that does not train the encoder."""
+    return Latents(lambda k: jax.lax.stop_gradient(latents.online(k)), latents.slow)
+
+
+def make_act(encoder: Encoder, q_values: Callable, *, noisy: bool) -> Callable:
+    """act: (params, head, frames, key, step, epsilon) -> actions, pure; jit it.
+
+    Args:
+        encoder: the shared encoder.
+        q_values: (head, latents, key | None) -> [N, A], an algorithm's.
+        noisy: whether noisy layers act with noise (training) or with their means (evaluation).
+
+    Returns:
+        The function. It takes the encoder's and the RL head's parameters, frames uint8 [N, S, H, W], a key,
+        a step (its draws come from fold_in(key, step)) and epsilon, a float32 scalar in [0, 1], and gives
+        int32 [N]: the greedy action, or with probability epsilon a uniformly random one.
+    """
+
+    def act(params: Params, head: Params, frames: Array, key: Array, step: Array, epsilon: Array) -> Array:
+        noise_key, coin_key, action_key = jax.random.split(jax.random.fold_in(key, step), 3)
+        z = encoder.apply(params, stack_last(frames))
+        q = q_values(head, z, noise_key if noisy else None)
+        number, num_actions = q.shape
+        random = jax.random.randint(action_key, (number,), 0, num_actions)
+        explore = jax.random.uniform(coin_key, (number,)) < epsilon
+        return jnp.where(explore, random, jnp.argmax(q, -1)).astype(jnp.int32)
+
+    return act

@@ -1,0 +1,32 @@
+"""Views of a `Window` on the device: the stacked observation at an offset."""
+
+import jax
+import jax.numpy as jnp
+
+from srl_jax.types import Array, Window
+
+
+def observation(window: Window, k: int | Array) -> Array:
+    """The stack of frames s_{t+k}, newest last: uint8 [B, H, W, S].
+
+    Args:
+        window: its frames are [B, S + K, H, W].
+        k: an offset in 0..K, an int for all rows or int32 [B], one for each.
+    """
+    size = window.frames.shape[1] - window.actions.shape[1]
+    if isinstance(k, int):
+        frames = window.frames[:, k : k + size]
+    else:
+        take = lambda row, start: jax.lax.dynamic_slice_in_dim(row, start, size)  # noqa: E731
+        frames = jax.vmap(take)(window.frames, k)
+    return stack_last(frames)
+
+
+def image(window: Window, k: int) -> Array:
+    """The observation at offset k as a regression target: float32 [B, H, W, S] in [0, 1]."""
+    return observation(window, k).astype(jnp.float32) / 255.0
+
+
+def stack_last(frames: Array) -> Array:
+    """[B, S, H, W], as replay and the actor keep it, -> [B, H, W, S], as networks read it."""
+    return jnp.moveaxis(frames, 1, -1)

@@ -1,0 +1,287 @@
+"""Tests of the command line: experiments.flags and experiments.train."""
+
+import json
+import os
+import pathlib
+import subprocess
+import sys
+import types
+
+import pytest
+from absl import flags
+
+import srl_jax
+from experiments import flags as config_flags
+from experiments import train
+from experiments.presets import PRESETS
+from srl_jax.config import INFOS, Config
+from srl_jax.specs import ConfigError
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+JOINT = ["--game=Catch", "--mode=joint", "--objective=reconstruction"]
+
+
+class Loop(types.ModuleType):
+    """Stands in for srl_jax.loop."""
+
+    def __init__(self):
+        super().__init__("srl_jax.loop")
+        self.calls = []
+
+    def train(self, config, out):
+        self.calls.append((config, out))
+
+
+@pytest.fixture
+def loop(monkeypatch):
+    stub = Loop()
+    monkeypatch.setitem(sys.modules, "srl_jax.loop", stub)
+    monkeypatch.setattr(srl_jax, "loop", stub, raising=False)
+    return stub
+
+
+def _parse(arguments):
+    values = flags.FlagValues()
+    train.define_flags(values)
+    config_flags.parse(["train", *arguments], values)
+    return values
+
+
+def _train(*arguments):
+    """What the entry point does, in this process and with flags of its own."""
+    try:
+        train.train(_parse(arguments))
+    except ConfigError as error:
+        config_flags.fail(error)
+
+
+def _config(*arguments):
+    return config_flags.config_from_flags(_parse(arguments), complete=False)
+
+
+def _python(*arguments):
+    return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60)
+
+
+def test_every_field_is_a_flag_with_help_and_its_default():
+    values = _parse([])
+    assert config_flags.config_from_flags(values) == Config()
+    for name, info in INFOS.items():
+        flag = values[info.flag or name]
+        assert info.help in flag.help and info.unit in flag.help
+        assert flag.value == (getattr(Config(), name) or flag.value)
+
+
+def test_flags_set_the_fields():
+    config = _config(
+        "--game=MsPacman", "--steps=1e6", "--gamma=0.9", "--notensorboard", "--reward_clip=false",
+        "--stop_at_return=-3.5", "--mode=joint", "--objective=a:weight=1,size=2", "--objective=b",
+    )  # fmt: skip
+    assert config == Config(
+        game="MsPacman", steps=1_000_000, gamma=0.9, reward_clip=False, stop_at_return=-3.5,
+        mode="joint", objectives=("a:weight=1,size=2", "b"),
+    )  # fmt: skip
+
+
+def test_flags_override_a_preset_even_where_they_give_the_default():
+    preset = "--preset=thesis/joint_256_l2_aug"
+    assert PRESETS["thesis/joint_256_l2_aug"]["augment"] == "all"
+    config = _config(preset, "--augment=none", "--objective=reconstruction", "--stop_at_return=off")
+    assert config.augment == "none" == Config().augment
+    assert config.objectives == ("reconstruction",)
+    assert config.stop_at_return is None
+    assert config.encoder == "sac_ae:features=256"
+    assert _config(preset).stop_at_return == 20
+    assert _config(preset, "--game=Breakout").stop_at_return is None
+    assert _config(preset, "--mode=rl_only", "--objective=none").objectives == ()
+
+
+def test_short_flags_stand_for_options_of_rl():
+    assert _config("--n_step=5", "--num_atoms=21").rl == "rainbow:n_step=5,atoms=21"
+    assert _config("--rl=dqn:double=true", "--alpha=1").rl == "dqn:double=true,alpha=1.0"
+    assert _config("--rl=rainbow:v_min=-1", "--v_min=-1.0").rl == "rainbow:v_min=-1"
+    assert _config("--preset=demo", "--noisy_std=0.5").rl == "rainbow:noisy_std=0.5"
+    # A preset's option is overridden like the rest of it; a typed one contradicts.
+    assert config_flags.with_rl_options("c51:n_step=1", {"n_step": 3}, False) == "c51:n_step=3"
+    with pytest.raises(ConfigError, match="--n_step=3: contradicts --rl=c51:n_step=1"):
+        _config("--rl=c51:n_step=1", "--n_step=3")
+
+
+BAD = [
+    (["--game=Pogn"], "--game=Pogn", "did you mean Pong?"),
+    (["--game=Pogn"], "--game=Pogn", "Breakout"),
+    (["--preset=thesis/joint_25"], "--preset=thesis/joint_25", "did you mean thesis/joint_256?"),
+    (["--preset="], "--preset=", "valid: "),
+    (["--mode=jiont"], "--mode=jiont", "did you mean joint?"),
+    (["--rl=rainbwo"], "--rl=rainbwo", "rainbow"),
+    (["--rl=rainbow:n_stp=3"], "--rl=rainbow:n_stp=3", "did you mean n_step?"),
+    (["--rl=rainbow:v_min=20"], "--rl=rainbow", "v_max"),
+    (["--encoder=natur"], "--encoder=natur", "did you mean nature?"),
+    (["--encoder=nature", "--frame_size=10", "--game=Pong"], "--encoder=nature", "10"),
+    (["--mode=joint", "--objective=recon"], "--objective=recon", "valid: reconstruction"),
+    ([*JOINT, "--objective=inverse:weigth=1"], "--objective=inverse", "did you mean weight?"),
+    ([*JOINT, "--objective=inverse:weight=-1"], "--objective=inverse", "not be negative"),
+    ([*JOINT, "--objective=reconstruction"], "--objective=reconstruction", "twice"),
+    (["--objective=reconstruction"], "--objective", "--mode=rl_only"),
+    (["--mode=joint"], "--objective", "at least one"),
+    (["--mode=frozen"], "--encoder_from", "--mode=frozen"),
+    (["--preset=thesis/frozen_256"], "--encoder_from", "--preset=thesis/pretrain_256"),
+    (["--preset=thesis/joint_from_pretrained_256"], "--encoder_from", "thesis/pretrain_256"),
+    (["--mode=finetuned", "--encoder_from=no/such"], "--encoder_from=no/such", "no such path"),
+    (["--mode=finetuned", "--encoder_from=."], "--encoder_from=.", ""),
+    (["--steps=-5"], "--steps=-5", "at least 1 (env steps)"),
+    (["--steps=abc"], "--steps=abc", "not a whole number"),
+    (["--steps", "abc"], "--steps=abc", "not a whole number"),
+    (["--lr_rl=nan"], "--lr_rl=nan", "finite"),
+    (["--gamma=1.5"], "--gamma=1.5", "at most 1"),
+    (["--n_step=0"], "--n_step=0", "at least 1"),
+    (["--reward_clip=maybe"], "--reward_clip=maybe", "true or false"),
+    (["--steps"], "--steps", ""),
+    (["--gane=Pong"], "--gane", "did you mean --game?"),
+    (["Pong"], "'Pong'", "--name=value"),
+]
+
+
+@pytest.mark.parametrize(("arguments", "flag", "choice"), BAD, ids=lambda value: str(value))
+def test_bad_input_is_one_line_and_status_2(arguments, flag, choice, tmp_path, capsys, loop):
+    out = tmp_path / "runs" / "a"
+    with pytest.raises(SystemExit) as ended:
+        _train(f"--out={out}", *arguments)
+    assert ended.value.code == 2
+    printed = capsys.readouterr()
+    assert printed.out == ""
+    assert printed.err.count("\n") == 1 and printed.err.endswith("\n")
+    assert flag in printed.err and choice in printed.err
+    assert list(tmp_path.iterdir()) == []
+    assert loop.calls == []
+
+
+def _refused(capsys, *arguments):
+    with pytest.raises(SystemExit) as ended:
+        _train("--game=Catch", *arguments)
+    assert ended.value.code == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    return line
+
+
+def test_out_is_needed(capsys, loop):
+    assert "--out: missing" in _refused(capsys)
+    assert "--out: missing" in _refused(capsys, "--out=")
+
+
+def test_out_that_cannot_be_made(capsys, loop, tmp_path, monkeypatch):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert "not a directory" in _refused(capsys, f"--out={file}")
+    assert "not a directory" in _refused(capsys, f"--out={file}/below")
+    # The system refuses such a name only after its parent was made; the parent must go again.
+    assert "--out=" in _refused(capsys, f"--out={tmp_path}/parent/{'x' * 300}")
+    assert list(tmp_path.iterdir()) == [file] and file.read_text() == "mine"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "no permission" in _refused(capsys, f"--out={tmp_path}/new")
+    (tmp_path / "empty").mkdir()
+    assert "no permission" in _refused(capsys, f"--out={tmp_path}/empty")
+    assert loop.calls == []
+
+
+def test_a_directory_with_files_is_kept(capsys, loop, tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    assert "not empty" in _refused(capsys, f"--out={tmp_path}")
+    # Somebody else's config.json does not make it a run.
+    assert "not a run directory" in _refused(capsys, f"--out={tmp_path}", "--overwrite")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+    assert loop.calls == []
+
+
+def test_overwrite_replaces_a_run_but_not_what_it_starts_from(capsys, loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    _train("--game=Catch", f"--out={out}")
+    (out / "metrics.jsonl").write_text("{}")
+    (out / "checkpoints").mkdir()
+    start = ["--mode=finetuned", f"--encoder_from={out}/checkpoints"]
+    line = _refused(capsys, f"--out={out}", "--overwrite", *start)
+    assert "--overwrite would delete --encoder_from" in line
+    monkeypatch.chdir(out)
+    assert "working directory" in _refused(capsys, f"--out={out}", "--overwrite")
+    monkeypatch.chdir(tmp_path)
+    assert (out / "metrics.jsonl").exists()
+    _train("--game=Catch", "--seed=1", f"--out={out}", "--overwrite")
+    assert [path.name for path in out.iterdir()] == ["config.json"]
+    assert Config.load(out).seed == 1
+
+
+def test_a_run_starts_with_its_config_written(loop, tmp_path):
+    out = tmp_path / "runs" / "a"
+    _train(*JOINT, "--objective=latent_l2:weight=1e-6", f"--out={out}")
+    ((config, path),) = loop.calls
+    assert path == str(out)
+    assert Config.load(out) == config
+    assert config.objectives == ("reconstruction:weight=1.0", "latent_l2:weight=1e-06")
+    assert "n_step=3" in config.rl
+    assert json.loads((out / "config.json").read_text())["versions"]["python"]
+
+
+def test_a_config_that_the_loop_refuses_leaves_nothing(capsys, loop, tmp_path, monkeypatch):
+    def refuse(config, out):
+        raise ConfigError("--encoder_from=x: another architecture")
+
+    monkeypatch.setattr(loop, "train", refuse)
+    line = _refused(capsys, f"--out={tmp_path}/runs/a")
+    assert line == "error: --encoder_from=x: another architecture\n"
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "empty").mkdir()
+    _refused(capsys, f"--out={tmp_path}/empty")
+    assert list((tmp_path / "empty").iterdir()) == []
+
+
+def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):
+    monkeypatch.setattr(train.importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit):
+        _train("--game=Pong", f"--out={tmp_path}/a")
+    assert "--game=Pong: Atari needs ale-py" in capsys.readouterr().err
+    assert "--tensorboard" in _refused(capsys, "--tensorboard", f"--out={tmp_path}/a")
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_print_config_shows_every_preset(preset, capsys, loop):
+    _train(f"--preset={preset}", "--print_config", "--seed=3")
+    config = Config.from_json(capsys.readouterr().out)
+    assert config.seed == 3
+    assert config.mode == PRESETS[preset]["mode"]
+    assert loop.calls == []
+
+
+def test_the_entry_point_refuses_a_game_in_one_line(tmp_path):
+    done = _python("-m", "experiments.train", "--game=Pogn", f"--out={tmp_path}/a")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: --game=Pogn: did you mean Pong? valid: Alien, ")
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_entry_point_refuses_an_option_in_one_line(tmp_path):
+    done = _python("-m", "experiments.train", "--rl=rainbow:v_min=20", f"--out={tmp_path}/a")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("error: --rl=rainbow:v_min=20")
+    assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_the_entry_point_prints_its_config():
+    done = _python("-m", "experiments.train", "--preset=thesis/joint_256", "--print_config")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert Config.from_json(done.stdout).encoder.startswith("sac_ae:features=256,")
+
+
+def test_help_lists_the_flags():
+    done = _python("-m", "experiments.train", "--help")
+    assert "--steps: length of the run [env steps]" in done.stdout
+
+
+def test_nothing_that_is_checked_first_imports_jax():
+    code = (
+        "import sys, experiments.train, srl_jax.config, srl_jax.modes, srl_jax.specs; "
+        "print([m for m in ('jax', 'flax', 'gymnasium', 'ale_py') if m in sys.modules])"
+    )
+    assert _python("-c", code).stdout.strip() == "[]"

@@ -1,0 +1,272 @@
+"""Tests of srl_jax.config and of srl_jax.modes, which a config is checked against."""
+
+import dataclasses
+import json
+import subprocess
+
+import hypothesis
+import pytest
+from hypothesis import strategies as st
+
+from srl_jax import config as config_module
+from srl_jax import modes
+from srl_jax.config import INFOS, Config, resolve
+from srl_jax.specs import ConfigError
+
+
+def _rl(context, *, n_step: int = 3, alpha: float = 0.5):
+    return context, n_step, alpha
+
+
+def _encoder(shape, *, features: int = 256):
+    return shape, features
+
+
+def _objective(context, *, weight: float = 1.0):
+    return context, weight
+
+
+REGISTRIES = {"rainbow": _rl}, {"nature": _encoder}, {"first": _objective, "second": _objective}
+
+
+def test_defaults_are_table_5_1():
+    # The rows of the thesis' table 5.1 that are not options of --rl.
+    table = {
+        "eps_eval": 0.005, "eps_train": 1.0, "eps_final": 0.05, "buffer_size": 100_000,
+        "lr_rl": 1e-4, "gamma": 0.99, "beta": 0.4, "beta_final": 1.0,
+        "beta_anneal_steps": 5_000_000, "slow_update_every": 500, "steps": 50 * 100_000,
+        "eval_every": 100_000, "num_envs": 10, "updates_per_step": 0.1, "batch_size": 32,
+        "eval_games": 10, "frame_stack": 4,
+    }  # fmt: skip
+    assert {name: getattr(Config(), name) for name in table} == table
+
+
+def _values(name, info):
+    if info.choices:
+        return st.sampled_from(info.choices)
+    if info.kind is bool:
+        return st.booleans()
+    if info.kind is tuple:
+        return st.lists(st.text(max_size=8), max_size=3).map(tuple)
+    if info.kind is str:
+        return st.text(max_size=8)
+    if info.kind is int:
+        return st.integers(info.minimum, info.maximum)
+    low = info.above if info.minimum is None else info.minimum
+    values = st.floats(
+        low, info.maximum, exclude_min=info.above is not None, allow_nan=False, allow_infinity=False
+    )
+    return values | st.none() if info.optional else values
+
+
+@st.composite
+def _configs(draw):
+    values = {
+        name: draw(_values(name, info))
+        for name, info in INFOS.items()
+        if name not in ("game", "frame_size", "buffer_size", "batch_size", "learn_start")
+    }
+    return Config(**values)
+
+
+@hypothesis.given(_configs())
+@hypothesis.settings(deadline=None, max_examples=8, suppress_health_check=[hypothesis.HealthCheck.too_slow])
+def test_json_round_trip_is_exact(config):
+    again = Config.from_json(config.to_json())
+    assert again == config
+    assert again.to_json() == config.to_json()
+    for name in INFOS:
+        assert type(getattr(again, name)) is type(getattr(config, name))
+
+
+def test_a_whole_number_is_a_float_where_a_float_is_meant():
+    assert type(Config(gamma=1).gamma) is float
+    assert Config(gamma=1).to_json() == Config(gamma=1.0).to_json()
+
+
+@pytest.mark.parametrize("name", [n for n, i in INFOS.items() if i.kind in (int, float)])
+def test_every_number_is_limited(name):
+    info = INFOS[name]
+    bad = [float("nan"), float("inf"), "1", True]
+    if not info.optional:  # A return may be negative; no other number may.
+        bad.append(info.kind(-1))
+    if info.above is not None:
+        bad.append(info.above)
+    if info.maximum is not None:
+        bad.append(info.maximum + 1)
+    for value in bad:
+        with pytest.raises(ConfigError, match=f"^--{name}=") as error:
+            Config(**{name: value})
+        assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"game": "Pogn"}, "--game=Pogn: did you mean Pong?"),
+        ({"mode": "jiont"}, "--mode=jiont: did you mean joint?"),
+        ({"augment": "both"}, "--augment=both: valid: none, srl, all"),
+        ({"objectives": "first"}, "--objective='first': not of type tuple"),
+        ({"objectives": (1,)}, "--objective=(1,): not of type tuple"),
+        ({"game": "Catch", "frame_size": 50}, "--frame_size=50: --game=Catch knows 42 and 84"),
+        ({"buffer_size": 20}, "--batch_size=32: must be at most --buffer_size=20"),
+        ({"learn_start": 100_001}, "--learn_start=100001: must be at most --buffer_size=100000"),
+    ],
+)
+def test_values_that_are_refused(values, message):
+    with pytest.raises(ConfigError) as error:
+        Config(**values)
+    assert str(error.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("{", "not JSON"),
+        ("[]", "not a JSON object"),
+        ('{"gmae": "Pong"}', "did you mean game?"),
+        ('{"steps": 1.5}', "--steps=1.5"),
+        ('{"gamma": NaN}', "--gamma=nan"),
+    ],
+)
+def test_json_that_is_refused(text, message):
+    with pytest.raises(ConfigError) as error:
+        Config.from_json(text)
+    assert message in str(error.value)
+
+
+def test_save_and_load(tmp_path):
+    config = Config(game="Catch", objectives=("first:weight=0.1",), stop_at_return=-1.5)
+    config.save(tmp_path)
+    assert Config.load(tmp_path) == config
+    saved = json.loads((tmp_path / "config.json").read_text())
+    assert saved["versions"].keys() >= {"python", "platform", "jax", "numpy"}
+    assert "git_revision" in saved
+    with pytest.raises(ConfigError, match="not a run directory"):
+        Config.load(tmp_path / "nothing")
+
+
+def test_git_revision(tmp_path, monkeypatch):
+    for variable in ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE"):
+        monkeypatch.delenv(variable, raising=False)
+    package = tmp_path / "srl_jax"
+    package.mkdir()
+    source = package / "config.py"
+    source.write_text("1")
+    monkeypatch.setattr(config_module, "__file__", str(source))
+
+    def git(*arguments):
+        user = ["-c", "user.name=n", "-c", "user.email=e@example.org", "-c", "commit.gpgsign=false"]
+        done = subprocess.run(
+            ["git", "-C", tmp_path, *user, *arguments], capture_output=True, text=True, check=True
+        )
+        return done.stdout.strip()
+
+    assert config_module.git_revision() is None  # No checkout.
+    git("init")
+    assert config_module.git_revision() is None  # No commit.
+    git("add", ".")
+    git("commit", "-m", "first")
+    assert config_module.git_revision() == git("rev-parse", "HEAD")
+    source.write_text("2")
+    assert config_module.git_revision() == git("rev-parse", "HEAD") + "-dirty"
+    # Installed somewhere below another project's checkout: its commit says nothing about us.
+    (tmp_path / "site-packages" / "srl_jax").mkdir(parents=True)
+    below = tmp_path / "site-packages" / "srl_jax" / "config.py"
+    monkeypatch.setattr(config_module, "__file__", str(below))
+    assert config_module.git_revision() is None
+
+
+def test_resolving_writes_out_every_default():
+    config = Config(
+        mode="joint", rl="rainbow:n_step=1", objectives=("second", "first:weight=2"), eval_every=7
+    )
+    full = resolve(config, *REGISTRIES)
+    assert full.rl == "rainbow:n_step=1,alpha=0.5"
+    assert full.encoder == "nature:features=256"
+    assert full.objectives == ("second:weight=1.0", "first:weight=2.0")
+    assert full.checkpoint_every == 7
+    assert full.lr_encoder == config.lr_rl
+    assert resolve(full, *REGISTRIES) == full
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"rl": "rainbwo"}, "--rl=rainbwo: no 'rainbwo'; did you mean rainbow?"),
+        ({"encoder": "nature:feature=1"}, "--encoder=nature:feature=1: nature has no option"),
+        ({"objectives": ("third",)}, "--objective=third: no 'third'"),
+        ({"objectives": ("first", "first:weight=2")}, "--objective=first: first is given twice"),
+    ],
+)
+def test_resolving_refuses(values, message):
+    with pytest.raises(ConfigError) as error:
+        resolve(Config(**values), *REGISTRIES)
+    assert str(error.value).startswith(message)
+
+
+def test_the_modes_are_the_table_of_the_thesis():
+    # name: RL runs, representation runs, starts from, RL trains it, representation trains it
+    assert {mode.name: tuple(mode[1:6]) for mode in modes.MODES.values()} == {
+        "rl_only": (True, False, "scratch", True, False),
+        "pretrain": (False, True, "either", False, True),
+        "frozen": (True, False, "checkpoint", False, False),
+        "finetuned": (True, False, "checkpoint", True, False),
+        "joint": (True, True, "either", True, True),
+        "decoupled": (True, True, "either", False, True),
+    }
+    assert list(modes.MODES) == [mode.name for mode in modes.MODES.values()]
+
+
+@pytest.mark.parametrize(
+    ("mode", "rate"),
+    [
+        ("rl_only", 2.0), ("finetuned", 2.0), ("joint", 2.0),
+        ("pretrain", 3.0), ("decoupled", 3.0), ("frozen", 0.0),
+    ],
+)  # fmt: skip
+def test_the_encoder_learns_at_its_trainers_rate(mode, rate):
+    config = Config(mode=mode, lr_rl=2.0, lr_srl=3.0)
+    assert modes.encoder_learning_rate(config) == rate
+    given = dataclasses.replace(config, lr_encoder=5.0)
+    assert modes.encoder_learning_rate(given) == 5.0
+
+
+@pytest.mark.parametrize("mode", modes.MODES.values(), ids=list(modes.MODES))
+def test_a_mode_takes_the_encoder_and_the_objectives_that_it_needs(mode):
+    objectives = ("first",) if mode.representation else ()
+    scratch = Config(mode=mode.name, objectives=objectives)
+    started = dataclasses.replace(scratch, encoder_from="runs/a")
+    for config, start in ((scratch, "scratch"), (started, "checkpoint")):
+        if mode.encoder_start in (start, "either"):
+            modes.check(config)
+        else:
+            with pytest.raises(ConfigError, match="^--encoder_from"):
+                modes.check(config)
+    right = scratch if mode.encoder_start != "checkpoint" else started
+    wrong = dataclasses.replace(right, objectives=() if objectives else ("first",))
+    with pytest.raises(ConfigError, match=f"^--objective: --mode={mode.name}"):
+        modes.check(wrong)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"mode": "rl_only", "policy_from": "x"}, "--policy_from=x: only --mode=pretrain"),
+        ({"mode": "rl_only", "augment": "srl"}, "--augment=srl: --mode=rl_only"),
+        ({"mode": "frozen", "encoder_from": "x", "lr_encoder": 1.0}, "--lr_encoder=1.0"),
+    ],
+)
+def test_settings_that_a_mode_ignores_are_refused(values, message):
+    with pytest.raises(ConfigError) as error:
+        modes.check(Config(**values))
+    assert str(error.value).startswith(message)
+    assert "\n" not in str(error.value)
+
+
+def test_an_encoder_may_be_needed_beyond_the_mode_or_not_be_asked_for():
+    joint = Config(mode="joint", objectives=("first",))
+    with pytest.raises(ConfigError, match="needs --encoder_from=PATH; make one$"):
+        modes.check(joint, needs_encoder=True, hint="make one")
+    modes.check(joint, needs_encoder=True, complete=False)
+    modes.check(Config(mode="frozen"), complete=False)

@@ -1,0 +1,17 @@
+"""What all tests share; pytest reads it before any test module, and so before jax is imported."""
+
+import os
+
+# The tests are written for a CPU; JAX_PLATFORMS=cuda runs them on a GPU all the same.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+from hypothesis import HealthCheck, settings  # noqa: E402
+
+# The first example of a property that runs on jax compiles, so no single example has a deadline.
+# Reproducible by default; HYPOTHESIS_PROFILE=thorough looks at many more, other ones each time.
+_quiet = [HealthCheck.too_slow, HealthCheck.data_too_large]
+settings.register_profile(
+    "default", max_examples=30, deadline=None, derandomize=True, suppress_health_check=_quiet
+)
+settings.register_profile("thorough", max_examples=1000, deadline=None, suppress_health_check=_quiet)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))

@@ -1,0 +1,230 @@
+"""Catch and CatchDistractor, and with them the interface that Atari shares."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from srl_jax import envs
+from srl_jax.envs import catch
+
+LEFT, NOOP, RIGHT = range(3)
+BOTH = pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
+
+
+def follow(state):
+    """A player that is told the state: keep the paddle under the ball."""
+    gap = state[:, 0] - state[:, 4]
+    return np.where(gap > 2, RIGHT, np.where(gap < -2, LEFT, NOOP))
+
+
+def play(env, policy, episodes):
+    """Returns of whole games."""
+    _, info = env.reset()
+    returns = []
+    while len(returns) < episodes:
+        _, rewards, ended, _, info = env.step(policy(info["state"]))
+        returns += rewards[ended].tolist()
+        assert not rewards[~ended].any()
+        if ended.any():
+            _, info = env.reset(options={"reset_mask": ended})
+    return np.array(returns)
+
+
+def record(env, actions):
+    """Everything that a run with these actions returns, as a list of arrays."""
+    frames, info = env.reset()
+    out = [frames, info["state"]]
+    for action in actions:
+        frames, rewards, terminated, truncated, info = env.step(action)
+        out += [frames, rewards, terminated, truncated, info["state"]]
+        if terminated.any():
+            frames, info = env.reset(options={"reset_mask": terminated})
+            out += [frames, info["state"]]
+    return out
+
+
+def same(a, b):
+    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+
+
+def put(env, ball_x, ball_y, drift, fall, paddle):
+    """Puts all games into one state."""
+    env.reset()
+    env._ball_x[:], env._ball_y[:], env._drift[:] = ball_x, ball_y, drift
+    env._fall[:], env._paddle[:] = fall, paddle
+
+
+def test_a_hand_worked_game():
+    env = envs.make("Catch", num_envs=1, seed=0)
+    # 81 + 3 is 84, 2 beyond the last column for a centre, 82: reflected to 80. Row 69 + 3 * 3 = 78,
+    # where the ball lies on the paddle. The paddle goes from 70 to 74, stays, and goes to 77, its
+    # last column, not to 78. |74 - 77| <= 7: caught.
+    put(env, ball_x=81, ball_y=69, drift=3, fall=3, paddle=70)
+    states, rewards, ends = [], [], []
+    for action in (RIGHT, NOOP, RIGHT):
+        _, reward, terminated, truncated, info = env.step(np.array([action]))
+        states.append(info["state"][0].tolist())
+        rewards.append(reward[0])
+        ends.append(bool(terminated[0]))
+        assert not truncated[0]
+    assert states == [[80, 72, -3, 3, 74], [77, 75, -3, 3, 74], [74, 78, -3, 3, 77]]
+    assert rewards == [0, 0, 1]
+    assert ends == [False, False, True]
+
+
+@pytest.mark.parametrize(("paddle", "reward"), [(43, 1), (57, 1), (42, -1), (58, -1)])
+def test_a_catch_is_one_shared_column(paddle, reward):
+    # The ball covers columns 49 to 51. A paddle at 43 covers 37 to 49, one at 42 up to 48.
+    env = envs.make("Catch", num_envs=1, seed=0)
+    put(env, ball_x=50, ball_y=74, drift=0, fall=4, paddle=paddle)
+    frames, rewards, terminated, _, _ = env.step(np.array([NOOP]))
+    assert rewards[0] == reward and terminated[0]
+    shared = (frames[0, 79] > 0) & (frames[0, 80] > 0)
+    assert shared.any() == (reward == 1)
+
+
+def test_left_wall_and_paddle_at_the_left():
+    env = envs.make("Catch", num_envs=1, seed=0)
+    put(env, ball_x=2, ball_y=10, drift=-3, fall=4, paddle=8)
+    _, _, _, _, info = env.step(np.array([LEFT]))
+    # 2 - 3 = -1, reflected at 1 to 3; the paddle stops at 6.
+    assert info["state"][0].tolist() == [3, 14, 3, 4, 6]
+
+
+def test_the_drawing_is_the_state():
+    actions = np.random.default_rng(0).integers(0, 3, (60, 8))
+    out = record(envs.make("Catch", num_envs=8, seed=3), actions)
+    frames = np.concatenate([x for x in out if x.ndim == 3]).astype(float)
+    states = np.concatenate([x for x in out if x.shape == (8, 5)])
+    assert len(frames) == len(states) > 480
+    ball, paddle = frames[:, :80], frames[:, 80:]
+    # 3 x 3 and 3 x 13 pixels of full brightness; rows 80 to 82 are the paddle's.
+    assert set(np.unique(frames)) == {0, catch.BRIGHTNESS}
+    assert (ball > 0).sum((1, 2)).tolist() == [9] * len(frames)
+    assert (paddle > 0).sum((1, 2)).tolist() == [39] * len(frames)
+    index = np.arange(84)
+    mass = ball.sum((1, 2))
+    np.testing.assert_allclose(ball.sum(1) @ index / mass, states[:, 0])
+    np.testing.assert_allclose(ball.sum(2) @ index[:80] / mass, states[:, 1])
+    np.testing.assert_allclose(paddle.sum(1) @ index / paddle.sum((1, 2)), states[:, 4])
+
+
+def test_the_small_frame_is_the_mean_of_the_large_one():
+    actions = np.random.default_rng(0).integers(0, 3, (60, 8))
+    large = record(envs.make("Catch", num_envs=8, seed=3), actions)
+    small = record(envs.make("Catch", num_envs=8, seed=3, frame_size=42), actions)
+    means = [x.reshape(8, 42, 2, 42, 2).mean((2, 4)) if x.ndim == 3 else x for x in large]
+    assert same(means, small)
+
+
+@BOTH
+@pytest.mark.parametrize("seed", range(3))
+def test_a_perfect_player_catches_every_ball(game, seed):
+    returns = play(envs.make(game, num_envs=100, seed=seed), follow, episodes=1000)
+    assert (returns == 1).all()
+
+
+def test_every_start_can_be_won():
+    # All starts at once, without the drawing: fall, steps, column, drift, paddle.
+    starts = np.array(
+        [
+            (x, catch.LAST_ROW - steps * fall, drift, fall, paddle)
+            for fall, steps in catch.DROPS
+            for x in range(catch.BALL_LEFT, catch.BALL_RIGHT + 1)
+            for drift in range(-catch.MAX_DRIFT, catch.MAX_DRIFT + 1)
+            for paddle in (24, 42, 59)
+        ]
+    )
+    assert starts[:, 1].min() >= catch.BALL_RADIUS
+    env = envs.make("Catch", num_envs=len(starts), seed=0)
+    env._frames = lambda: None
+    put(env, *starts.T)
+    caught = np.zeros(len(starts), bool)
+    done = np.zeros(len(starts), bool)
+    state = starts
+    for _ in range(25):
+        env._ended[:] = False
+        _, rewards, ended, _, info = env.step(follow(state))
+        state = info["state"]
+        caught |= (rewards > 0) & ~done
+        done |= ended
+    assert done.all() and caught.all()
+
+
+def test_a_random_player_misses_most():
+    rng = np.random.default_rng(0)
+    env = envs.make("Catch", num_envs=100, seed=0)
+    returns = play(env, lambda state: rng.integers(0, 3, 100), episodes=1500)
+    assert 0.1 < (returns == 1).mean() < 0.3
+
+
+def test_length_of_an_episode():
+    env = envs.make("Catch", num_envs=200, seed=0)
+    env._frames = lambda: None  # balls fall on, out of the picture
+    env.reset()
+    length = np.zeros(200, int)
+    done = np.zeros(200, bool)
+    for step in range(1, 26):
+        env._ended[:] = False
+        _, _, ended, _, _ = env.step(np.full(200, NOOP))
+        length[ended & ~done] = step
+        done |= ended
+    assert set(length) == {18, 19, 21, 22, 23, 24, 25}
+
+
+@BOTH
+@settings(deadline=None, max_examples=10)
+@given(seed=st.integers(0, 2**70), actions_seed=st.integers(0, 2**32))
+def test_same_seed_same_actions_same_run(game, seed, actions_seed):
+    actions = np.random.default_rng(actions_seed).integers(0, 3, (40, 3))
+    first = record(envs.make(game, num_envs=3, seed=seed), actions)
+    assert same(first, record(envs.make(game, num_envs=3, seed=seed), actions))
+    # An environment does not depend on how many others there are.
+    single = record(envs.make(game, num_envs=1, seed=seed), actions[:, :1])
+    assert np.array_equal(single[0][0], first[0][0])
+
+
+@pytest.mark.parametrize("size", [84, 42])
+def test_the_distractor_ignores_actions_and_episodes(size):
+    def backgrounds(policy):
+        env = envs.make("CatchDistractor", num_envs=3, seed=4, frame_size=size)
+        env._draw = lambda *args: None  # nothing in front
+        out = [env.reset()[0]]
+        for step in range(70):
+            frames, _, ended, _, _ = env.step(np.full(3, policy(step)))
+            out.append(frames)
+            if ended.any():
+                frames, _ = env.reset(options={"reset_mask": ended})
+                np.testing.assert_array_equal(frames, out[-1])
+        return np.array(out)
+
+    first = backgrounds(lambda step: step % 3)
+    np.testing.assert_array_equal(first, backgrounds(lambda step: LEFT))
+    # It moves at every step, at 42 at least at every second one, in every environment.
+    moved = (first[2:] != first[:-2]).any((2, 3))
+    assert moved.all()
+    # The environments see different stretches of it.
+    assert not np.array_equal(first[:, 0], first[:, 1])
+
+
+@pytest.mark.parametrize("size", [84, 42])
+def test_the_distractor_dominates_and_hides_nothing(size):
+    options = {"num_envs": 32, "seed": 0, "frame_size": size}
+    plain, _ = envs.make("Catch", **options).reset()
+    frames, _ = envs.make("CatchDistractor", **options).reset()
+    behind = plain == 0
+    assert frames[behind].var() > 3 * plain.var()
+    assert frames[behind].max() <= 2 * catch.LAYER_BRIGHTNESS < catch.BRIGHTNESS - 50
+    # What is covered in full looks the same in both; what is half covered is a blend.
+    full = plain == catch.BRIGHTNESS
+    assert (frames[full] == catch.BRIGHTNESS).all() and full.any((1, 2)).all()
+
+
+def test_both_games_drop_the_same_balls():
+    actions = np.random.default_rng(1).integers(0, 3, (60, 5))
+    runs = []
+    for game in ("Catch", "CatchDistractor"):
+        out = record(envs.make(game, num_envs=5, seed=9), actions)
+        runs.append([x for x in out if x.dtype != np.uint8])
+    assert same(*runs)

@@ -1,0 +1,84 @@
+"""Tests of experiments.presets."""
+
+import dataclasses
+
+import pytest
+
+from experiments import train
+from experiments.presets import ENCODER_PRESETS, PRESETS, preset_values
+from srl_jax import modes, specs
+from srl_jax.config import Config
+
+# The arms of every figure of the thesis, and the runs that make their encoders.
+ARMS = [
+    "rl_only_nature", "finetuned_from_rl_nature", "finetuned_256_aug", "frozen_256", "rl_only_256",
+    "rl_only_256_aug", "joint_256", "joint_50", "joint_256_l2_aug", "joint_256_noreg",
+    "joint_forward_256", "joint_forward_256_aug", "joint_from_pretrained_256", "pretrain_256",
+    "pretrain_256_aug",
+]  # fmt: skip
+
+
+def _config(name, **values):
+    config = Config(**{**preset_values(name), **values})
+    if name in ENCODER_PRESETS:
+        config = dataclasses.replace(config, encoder_from="runs/encoder")
+    return config
+
+
+def test_every_arm_has_a_preset():
+    assert {f"thesis/{arm}" for arm in ARMS} == {n for n in PRESETS if n.startswith("thesis/")}
+
+
+def test_every_mode_has_a_catch_preset():
+    assert {f"catch/{mode}" for mode in modes.MODES} == {n for n in PRESETS if n.startswith("catch/")}
+    for mode in modes.MODES:
+        assert _config(f"catch/{mode}").mode == mode
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_preset_is_a_valid_run(name):
+    config = _config(name)
+    modes.check(config)
+    full = train.resolved(config)
+    assert train.resolved(full) == full
+
+
+@pytest.mark.parametrize("name", [f"thesis/{arm}" for arm in ARMS])
+def test_an_arm_is_what_its_name_says(name):
+    config = _config(name)
+    assert config.mode == name.removeprefix("thesis/").split("_")[0].replace("rl", "rl_only")
+    features = "50" if name.endswith("_50") else "256"
+    nature = name.endswith("nature")
+    assert config.encoder == ("nature" if nature else f"sac_ae:features={features}")
+    assert config.augment == ("all" if name.endswith("_aug") else "none")
+    losses = [specs.split(text) for text in config.objectives]
+    expected = []
+    if modes.MODES[config.mode].representation:
+        first = "forward_pixels" if "_forward_" in name else "reconstruction"
+        expected = [(first, {"weight": "1"})]
+        if not name.endswith("noreg"):
+            expected.append(("latent_l2", {"weight": "1e-6"}))
+    assert losses == expected
+    assert config.decoder_weight_decay == (0 if name.endswith("noreg") else 1e-7)
+    if config.mode == "pretrain":
+        # 15 epochs of 100,000 env steps, batch 64, 0.3 updates per env step, epsilon 0.3.
+        assert (config.steps, config.batch_size) == (1_500_000, 64)
+        assert (config.updates_per_step, config.pretrain_epsilon) == (0.3, 0.3)
+    else:
+        assert (config.steps, config.batch_size, config.updates_per_step) == (5_000_000, 32, 0.1)
+
+
+def test_an_encoder_comes_from_a_run_that_fits():
+    needs = {name for name, values in PRESETS.items() if values["mode"] in ("frozen", "finetuned")}
+    assert set(ENCODER_PRESETS) == needs | {"thesis/joint_from_pretrained_256"}
+    for name, source in ENCODER_PRESETS.items():
+        user, maker = _config(name), _config(source)
+        for field in ("encoder", "frame_size", "frame_stack", "game"):
+            assert getattr(user, field) == getattr(maker, field)
+
+
+def test_only_pong_of_the_thesis_games_stops_early():
+    assert preset_values("thesis/joint_256")["stop_at_return"] == 20
+    assert "stop_at_return" not in preset_values("thesis/joint_256", "Breakout")
+    assert "stop_at_return" not in preset_values("thesis/pretrain_256")
+    assert "stop_at_return" not in PRESETS["thesis/joint_256"]
