@@ -16,7 +16,7 @@ from srl_jax.update import Hyper, make_act, make_init, make_update, periodic
 
 
 class Agent(NamedTuple):
-    """What a configuration means, as pure functions; update and the two acts are jitted.
+    """What a configuration means, as pure functions; init, update and the two acts are jitted.
 
     Attributes:
         mode: the row of the table of modes.
@@ -81,7 +81,10 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         algorithm=algorithm,
         objectives=terms,
         horizon=max(1, *(o.horizon for o in terms.values())),
-        init=make_init(encoder, terms, mode, optimizer, target_encoder=config.target_encoder),
+        init=jax.jit(
+            make_init(encoder, terms, mode, optimizer, target_encoder=config.target_encoder),
+            compiler_options={"xla_backend_optimization_level": 0},  # it runs once: compile it fast
+        ),
         update=jax.jit(
             make_update(
                 encoder,

@@ -108,10 +108,10 @@ def read_manifest(path: str | Path) -> Manifest:
         numbers = [content[name] for name in ("num_actions", "env_steps", "updates")]
         if not all(type(number) is int for number in numbers):
             raise ValueError("counts are not integers")
-        if set(content["files"]) != {_PARAMS}:
+        files = content["files"]
+        if list(files) != [_PARAMS] or type(files[_PARAMS]["sha256"]) is not str:
             raise ValueError("files are not what they should be")
-        config = Config.from_json(json.dumps(content["config"]))
-        return Manifest(path, config, *numbers, content["files"])
+        config = json.dumps(content["config"])
     except OSError:
         raise ConfigError(
             f"{path}: no checkpoint there; name a run directory or one of its checkpoints"
@@ -120,6 +120,10 @@ def read_manifest(path: str | Path) -> Manifest:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(f"{path / _MANIFEST}: damaged ({error})") from None
+    try:
+        return Manifest(path, Config.from_json(config), *numbers, files)
+    except ConfigError as error:
+        raise ConfigError(f"{path / _MANIFEST}: {error}") from None
 
 
 def load(manifest: Manifest) -> Any:
@@ -135,9 +139,15 @@ def load(manifest: Manifest) -> Any:
         data = path.read_bytes()
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    if hashlib.sha256(data).hexdigest() != manifest.files[_PARAMS].get("sha256"):
+    if hashlib.sha256(data).hexdigest() != manifest.files[_PARAMS]["sha256"]:
         raise ConfigError(f"{path}: damaged: its sha256 is not the manifest's")
-    return serialization.msgpack_restore(data)
+    try:
+        tree = serialization.msgpack_restore(data)
+        if set(tree) != {"encoder", "heads"}:
+            raise ValueError("not an encoder and heads")
+    except Exception as error:  # msgpack's and flax's own; the sum fits, so somebody wrote it so
+        raise ConfigError(f"{path}: not parameters ({type(error).__name__}: {error})") from None
+    return tree
 
 
 def load_into(template: Any, tree: Any, what: str) -> Any:

@@ -27,6 +27,22 @@ def uniform_fan_in(fan_in: int):
     return init
 
 
+def he_normal(fan_in: int):
+    """An initialiser: a normal of variance 2 / fan_in, truncated at two deviations; for kernels below a ReLU.
+
+    It keeps the size of a signal through convolutions and ReLU (He et al. 2015, equation 10). PyTorch's
+    default shrinks it 2.4 times a layer, which goes unnoticed with pixels in 0..255, as the thesis' code has
+    them; with pixels in [0, 1] it left the latents of different Pong frames 4 % apart, against 17 %.
+    """
+    std = math.sqrt(2.0 / fan_in)
+
+    def init(key, shape, dtype=jnp.float32):
+        # 0.88 is the standard deviation of the standard normal truncated at 2.
+        return std / 0.8796 * jax.random.truncated_normal(key, -2.0, 2.0, shape, dtype)
+
+    return init
+
+
 class Dense(nn.Module):
     """A linear layer, float32 [B, inputs] -> [B, features]; PyTorch's default initialisation."""
 
@@ -41,7 +57,7 @@ class Dense(nn.Module):
 
 
 class Conv(nn.Module):
-    """A VALID convolution, float32 [B, H, W, C] -> [B, H', W', features]; PyTorch's initialisation."""
+    """A VALID convolution, float32 [B, H, W, C] -> [B, H', W', features]; `he_normal`, biases 0."""
 
     features: int
     kernel: int
@@ -49,9 +65,9 @@ class Conv(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        init = uniform_fan_in(self.kernel**2 * x.shape[-1])
+        init = he_normal(self.kernel**2 * x.shape[-1])
         kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
-        bias = self.param("bias", init, (self.features,))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
         return _valid_conv(x, kernel, self.stride) + bias
 
 
@@ -81,9 +97,9 @@ class ConvTranspose(nn.Module):
         height = x.shape[1]
         if not 0 <= self.size - ((height - 1) * s + k) < s:
             raise ValueError(f"a kernel of {k} with stride {s} cannot make {self.size} pixels from {height}")
-        init = uniform_fan_in(k**2 * self.features)  # PyTorch counts the output side here
+        init = he_normal(max(1, k // s) ** 2 * channels)  # the inputs that reach an output pixel
         kernel = self.param("kernel", init, (k, k, channels, self.features))
-        bias = self.param("bias", init, (self.features,))
+        bias = self.param("bias", nn.initializers.zeros, (self.features,))
         taps = -(-k // s)
         kernel = jnp.pad(kernel, [(0, taps * s - k)] * 2 + [(0, 0)] * 2)
         kernel = kernel.reshape(taps, s, taps, s, channels, self.features)[::-1, :, ::-1]
@@ -102,7 +118,7 @@ class NoisyDense(nn.Module):
     """A linear layer with factorised Gaussian noise on its weights (Fortunato et al. 2018, section 3).
 
     `y = x (mu + sigma * f(e_in) f(e_out)^T) + mu_b + sigma_b * f(e_out)`, with f(e) = sign(e) sqrt(|e|).
-    One draw serves the whole batch. Without a key the layer acts with its means.
+    One draw serves the whole batch. Without noise the layer acts with its means.
 
     Attributes:
         features: outputs.
@@ -113,7 +129,8 @@ class NoisyDense(nn.Module):
     std: float = 0.1
 
     @nn.compact
-    def __call__(self, x: Array, key: Array | None) -> Array:
+    def __call__(self, x: Array, noise: Array | None) -> Array:
+        """float32 [B, inputs], and e: standard normal [inputs + features] or None -> [B, features]."""
         inputs = x.shape[-1]
         init = uniform_fan_in(inputs)
         sigma = nn.initializers.constant(self.std / math.sqrt(inputs))
@@ -121,9 +138,8 @@ class NoisyDense(nn.Module):
         bias = self.param("bias", init, (self.features,))
         kernel_sigma = self.param("kernel_sigma", sigma, (inputs, self.features))
         bias_sigma = self.param("bias_sigma", sigma, (self.features,))
-        if key is None:
+        if noise is None:
             return x @ kernel + bias
-        noise = jax.random.normal(key, (inputs + self.features,))
         noise = jnp.sign(noise) * jnp.sqrt(jnp.abs(noise))
         noise_in, noise_out = noise[:inputs], noise[inputs:]
         kernel = kernel + kernel_sigma * (noise_in[:, None] * noise_out[None, :])

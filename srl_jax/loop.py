@@ -78,7 +78,7 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
     """
     manifest = checkpoint.read_manifest(path)
     agent = make_agent(manifest.config, manifest.num_actions)
-    template = jax.eval_shape(lambda key: agent.init(key).params, jax.random.key(0))
+    template = jax.eval_shape(agent.init, jax.random.key(0)).params
     params = checkpoint.load_into(template, checkpoint.load(manifest), str(manifest.path))
     return agent, params, manifest
 

@@ -62,7 +62,7 @@ def make_optimizer(
     transform = optax.chain(*chain, optax.scale_by_adam(eps=adam_eps))
 
     def update(grads, state, params, learning_rates: dict[str, Array]):
-        norm = optax.global_norm(grads)
+        norm = optax.tree.norm(grads)
         updates, state = transform.update(grads, state, params)
         rates = {}
         for group, tree in params.items():

@@ -69,7 +69,7 @@ def make_init(
             slow=real_copy(slow),
             opt_state=optimizer.init(trainable),
             step=jnp.zeros((), jnp.int32),
-            key=key,
+            key=real_copy(key),
         )
 
     return init

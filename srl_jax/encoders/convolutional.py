@@ -10,6 +10,10 @@ from srl_jax.layers import Conv, ConvTranspose, Dense
 from srl_jax.types import Array, Decoder, Encoder
 
 
+LEAST_SEEN = 0.95
+"""The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
+
+
 class Layer(NamedTuple):
     """One convolution: output channels, side of the kernel and stride, both in pixels."""
 
@@ -104,7 +108,8 @@ def convolutional(
         sigmoid: whether the decoder ends in a sigmoid (in (0, 1)) or is linear at the end.
 
     Raises:
-        ValueError: where the image is not square or too small for the layers.
+        ValueError: where the image is not square, too small for the layers, or the layers' strides leave
+            out more of its last rows and columns than 1 in 20.
     """
     height, width, channels = observation_shape
     if height != width:
@@ -116,6 +121,14 @@ def convolutional(
                 f"frames of {height} pixels are too small: a kernel of {layer.kernel} would see {sizes[-1]}"
             )
         sizes.append((sizes[-1] - layer.kernel) // layer.stride + 1)
+    seen = sizes[-1]
+    for layer in reversed(layers):
+        seen = (seen - 1) * layer.stride + layer.kernel
+    if seen < LEAST_SEEN * height:
+        raise ValueError(
+            f"of frames of {height} pixels these layers see {seen} x {seen} and leave out the rest; "
+            f"{seen} fits"
+        )
     layers, sizes = tuple(layers), tuple(sizes)
     network = EncoderNetwork(layers, features, layer_norm)
     latent = features or sizes[-1] ** 2 * layers[-1].channels

@@ -3,6 +3,7 @@
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from srl_jax.layers import Dense, NoisyDense
 from srl_jax.types import Array
@@ -28,19 +29,28 @@ class QNetwork(nn.Module):
     @nn.compact
     def __call__(self, z: Array, key: Array | None) -> Array:
         """float32 [B, D] -> float32 [B, A, M]: logits, or values where M is 1. No key, no noise."""
-        keys = iter([None] * 4 if key is None else jax.random.split(key, 4))
+        outputs = {"q": self.num_actions * self.atoms}
+        if self.dueling:
+            outputs["v"] = self.atoms
+        sizes = [(z.shape[-1], self.hidden, out) for out in outputs.values()]
+        noise = self._noise(key, sizes) if self.noisy and key is not None else [None] * 2 * len(sizes)
 
         def layer(name: str, features: int, x: Array) -> Array:
-            noise = next(keys)
             if self.noisy:
-                return NoisyDense(features, self.noisy_std, name=name)(x, noise)
+                return NoisyDense(features, self.noisy_std, name=name)(x, noise.pop(0))
             return Dense(features, name=name)(x)
 
-        def stream(name: str, outputs: int) -> Array:
+        def stream(name: str) -> Array:
             x = nn.relu(layer(f"{name}_hidden", self.hidden, z))
-            return layer(f"{name}_out", outputs * self.atoms, x).reshape(-1, outputs, self.atoms)
+            return layer(f"{name}_out", outputs[name], x).reshape(z.shape[0], -1, self.atoms)
 
-        q = stream("q", self.num_actions)
+        q = stream("q")
         if self.dueling:
-            q = q - jnp.mean(q, 1, keepdims=True) + stream("v", 1)
+            q = q - jnp.mean(q, 1, keepdims=True) + stream("v")
         return q
+
+    def _noise(self, key: Array, sizes: list[tuple]) -> list[Array]:
+        """Each layer's noise, cut from one draw: every draw more costs compilation time."""
+        lengths = [n for inputs, hidden, out in sizes for n in (inputs + hidden, hidden + out)]
+        ends = np.cumsum(lengths)
+        return jnp.split(jax.random.normal(key, (int(ends[-1]),)), ends[:-1].tolist())

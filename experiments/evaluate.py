@@ -1,0 +1,95 @@
+"""Plays full games from a checkpoint: `python -m experiments.evaluate --run=runs/pong --gif=pong.gif`.
+
+Prints one JSON object: the game, the checkpoint's env steps, the mean, and every return and length.
+"""
+
+import json
+from pathlib import Path
+
+from absl import flags
+
+from experiments import flags as config_flags
+from srl_jax.specs import ConfigError
+
+FLAGS = flags.FLAGS
+
+
+def check_gif(path: str) -> None:
+    """Whether a GIF can be written there.
+
+    Raises:
+        ConfigError: it cannot, or there is one already.
+    """
+    from experiments import plots
+
+    if not plots.available():
+        raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
+    if Path(path).suffix.lower() != ".gif":
+        raise ConfigError(f"--gif={path}: must end in .gif")
+    if Path(path).exists():
+        raise ConfigError(f"--gif={path}: exists; name a new file")
+    if not Path(path).absolute().parent.is_dir():
+        raise ConfigError(f"--gif={path}: no such directory")
+
+
+def main(argv: list[str]) -> None:
+    """The entry point."""
+    del argv
+    if not FLAGS.run:
+        raise ConfigError("--run: missing; name a run directory or a checkpoint, --run=runs/NAME")
+    if FLAGS.gif:
+        check_gif(FLAGS.gif)
+    from srl_jax import checkpoint
+    from srl_jax.modes import MODES
+
+    config = checkpoint.read_manifest(FLAGS.run).config
+    if not MODES[config.mode].rl:
+        raise ConfigError(f"--run={FLAGS.run}: a run of --mode={config.mode} has no policy to play with")
+
+    import jax
+
+    from srl_jax import envs, loop
+    from srl_jax.evaluate import evaluate
+
+    agent, params, manifest = loop.load_agent(FLAGS.run)
+    env = envs.make(
+        config.game,
+        num_envs=min(FLAGS.games, config.num_envs),
+        seed=FLAGS.seed,
+        frame_size=config.frame_size,
+        sticky_actions=config.sticky_actions,
+        noop_max=config.noop_max,
+    )
+    played = evaluate(
+        loop.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
+        env,
+        games=FLAGS.games,
+        seed=FLAGS.seed,
+        epsilon=config.eps_eval if FLAGS.epsilon is None else FLAGS.epsilon,
+        stack=config.frame_stack,
+        max_steps=config.eval_max_steps,
+        record=bool(FLAGS.gif),
+    )
+    result = {
+        "game": config.game,
+        "env_steps": manifest.env_steps,
+        "return_mean": sum(played.returns) / len(played.returns),
+        "returns": played.returns,
+        "lengths": played.lengths,
+    }
+    print(json.dumps(result))
+    if FLAGS.gif:
+        from experiments import plots
+
+        plots.gif(played.frames, FLAGS.gif)
+
+
+if __name__ == "__main__":
+    flags.DEFINE_string("run", "", "run directory, or one of its checkpoints")
+    flags.DEFINE_integer("games", 10, "full games to play", lower_bound=1)
+    flags.DEFINE_integer("seed", 0, "of the games; the same seed gives the same games", lower_bound=0)
+    flags.DEFINE_float(
+        "epsilon", None, "probability of a random action; the run's eps_eval if not given", 0.0, 1.0
+    )
+    flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF")
+    config_flags.run(main)

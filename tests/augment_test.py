@@ -1,0 +1,59 @@
+"""srl_jax/augment.py against numpy's padding, and a shift drawn by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from srl_jax.augment import random_shift
+from tests.helpers import jit
+
+
+def shifts(frames, pad):
+    """{(dy, dx): the frames padded by repetition and cropped there}: all that may come out."""
+    padded = np.pad(frames, [(0, 0), (pad, pad), (pad, pad)], mode="edge")
+    height, width = frames.shape[1:]
+    return {
+        (y - pad, x - pad): padded[:, y : y + height, x : x + width]
+        for y in range(2 * pad + 1)
+        for x in range(2 * pad + 1)
+    }
+
+
+def draw(frames, pad, number, seed=0):
+    keys = jax.random.split(jax.random.key(seed), number)
+    return np.asarray(jit(jax.vmap(lambda key: random_shift(jnp.asarray(frames), key, pad)))(keys))
+
+
+def test_a_shift_by_hand():
+    # Down by one in the crop (so the picture moves up and its last row repeats), and left by one (so it
+    # moves right and its first column repeats).
+    frames = np.array([[[1, 2, 3], [4, 5, 6], [7, 8, 9]]], np.uint8)
+    expected = [[4, 4, 5], [7, 7, 8], [7, 7, 8]]
+    np.testing.assert_array_equal(shifts(frames, 1)[1, -1][0], expected)
+    assert any(np.array_equal(shifted[0], expected) for shifted in draw(frames, 1, 100))
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.float32])
+def test_every_draw_is_one_shift_of_the_whole_sequence_and_all_shifts_come_up(dtype):
+    # 25 shifts of 3 frames of 6 x 7 pixels; all pixels differ, so a result names its shift.
+    frames = np.random.default_rng(0).permutation(3 * 6 * 7).reshape(3, 6, 7).astype(dtype)
+    names = {shifted.tobytes(): offset for offset, shifted in shifts(frames, 2).items()}
+    assert len(names) == 25
+    results = draw(frames, 2, 1000)
+    assert results.dtype == dtype
+    found = [names[np.ascontiguousarray(shifted).tobytes()] for shifted in results]
+    counts = [found.count(offset) for offset in names.values()]
+    # Uniform: 40 expected of each, with standard deviation 6.2.
+    assert min(counts) > 15 and max(counts) < 70
+
+
+def test_four_pixels_is_the_default_and_none_the_identity():
+    frames = np.random.default_rng(0).integers(0, 256, (1, 20, 20), dtype=np.uint8)
+    keys = jax.random.split(jax.random.key(0), 200)
+    allowed = {shifted.tobytes() for shifted in shifts(frames, 4).values()}
+    results = np.asarray(jit(jax.vmap(lambda key: random_shift(jnp.asarray(frames), key)))(keys))
+    found = {np.ascontiguousarray(shifted).tobytes() for shifted in results}
+    assert found <= allowed
+    assert len(found) > 60  # 81 shifts; 3 pixels would have 49
+    np.testing.assert_array_equal(draw(frames, 0, 1)[0], frames)

@@ -1,0 +1,130 @@
+"""srl_jax/evaluate.py on games whose whole course is written down."""
+
+import numpy as np
+import pytest
+from gymnasium.spaces import Box
+
+from srl_jax import envs
+from srl_jax.evaluate import evaluate
+
+
+class Scripted:
+    """N environments that play given games, each a list of rewards; None for one that never ends.
+
+    Every frame names its environment, game and step, as the pixel 100 * i + 10 * game + step (below 256).
+    """
+
+    single_observation_space = Box(0, 255, (1, 1), np.uint8)
+
+    def __init__(self, scripts, truncate=False):
+        self.scripts, self.num_envs, self.truncate = scripts, len(scripts), truncate
+        self.game, self.time = np.zeros((2, self.num_envs), int)
+        self.ended = np.zeros(self.num_envs, bool)
+        self.seeds, self.actions = [], []
+
+    def frames(self):
+        pixels = 100 * np.arange(self.num_envs) + 10 * self.game + self.time
+        return pixels.astype(np.uint8)[:, None, None]
+
+    def script(self, i):
+        return self.scripts[i][self.game[i] % len(self.scripts[i])]
+
+    def reset(self, *, seed=None, options=None):
+        self.seeds.append(seed)
+        if options is None:
+            self.game[:], self.time[:], self.ended[:] = 0, 0, False
+        else:
+            mask = options["reset_mask"]
+            self.game[mask] += 1
+            self.time[mask], self.ended[mask] = 0, False
+        return self.frames(), {}
+
+    def step(self, actions):
+        assert not self.ended.any(), "stepped after its end"
+        self.actions.append(actions)
+        scripts = [self.script(i) for i in range(self.num_envs)]
+        rewards = [1.0 if s is None else s[t] for s, t in zip(scripts, self.time, strict=True)]
+        self.time += 1
+        over = np.array([s is not None and t == len(s) for s, t in zip(scripts, self.time, strict=True)])
+        self.ended = over
+        never = np.zeros_like(over)
+        ends = (never, over) if self.truncate else (over, never)
+        info = {"life_lost": np.ones(self.num_envs, bool)}
+        return self.frames(), np.array(rewards, np.float32), *ends, info
+
+
+def watching(seen):
+    """A policy that notes what it is shown and always does 1."""
+
+    def policy(frames, step, epsilon):
+        seen.append((frames[..., 0, 0].tolist(), step, epsilon))
+        return np.ones(len(frames), np.int32)
+
+    return policy
+
+
+def play(env, **options):
+    return evaluate(watching([]), env, **{"seed": 3, "epsilon": 0.1} | options)
+
+
+@pytest.mark.parametrize("truncate", [False, True])
+def test_short_games_are_not_favoured_and_scores_are_raw(truncate):
+    # Environment 0 plays games of one step worth 7, environment 1 games of three steps worth -2 + 0 + 5.5.
+    # Five games: three of the short ones and two of the long ones, though five short ones end before two long
+    # ones do. A lost life (in every step here) ends nothing.
+    env = Scripted([[[7.0]], [[-2.0, 0.0, 5.5]]], truncate)
+    result = play(env, games=5)
+    assert result.returns == [7.0, 3.5, 7.0, 3.5, 7.0]
+    assert result.lengths == [1, 3, 1, 3, 1]
+    assert result.frames.shape == (0, 1, 1)
+    assert len(env.actions) == 6  # not a step longer than the second long game
+
+
+def test_games_are_counted_from_zero():
+    # Scores do not leak into the next game: 1, then 2, then 4 in one environment.
+    env = Scripted([[[1.0], [1.0, 1.0], [4.0]]])
+    assert play(env, games=3).returns == [1.0, 2.0, 4.0]
+
+
+def test_fewer_games_than_environments():
+    env = Scripted([[[1.0, 1.0]], [[5.0]], [None]])
+    assert play(env, games=2).returns == [2.0, 5.0]  # and the endless third one is not waited for
+
+
+def test_an_endless_game_is_cut_with_its_score_as_it_stands():
+    env = Scripted([[None, [3.0]], [[1.0, 1.0, 1.0, 1.0]]])
+    result = play(env, games=4, max_steps=4)
+    assert result.returns == [4.0, 4.0, 3.0, 4.0]
+    assert result.lengths == [4, 4, 1, 4]
+
+
+def test_the_first_game_is_recorded_from_its_first_frame_to_its_last():
+    env = Scripted([[[0.0] * 3, [0.0] * 2], [[0.0]]])
+    result = play(env, games=4, record=True)
+    assert result.frames.dtype == np.uint8
+    assert result.frames.ravel().tolist() == [0, 1, 2, 3]
+
+
+def test_what_the_policy_sees():
+    # Two steps a game. Stacks begin with the first frame of each game, and steps go on counting.
+    seen = []
+    env = Scripted([[[0.0] * 2]])
+    evaluate(watching(seen), env, games=2, seed=3, epsilon=0.25, stack=3)
+    frames, steps, epsilons = zip(*seen, strict=True)
+    assert [f[0] for f in frames] == [[0, 0, 0], [0, 0, 1], [10, 10, 10], [10, 10, 11]]
+    assert steps == (0, 1, 2, 3) and set(epsilons) == {0.25}
+    assert env.seeds[0] == 3 and not any(env.seeds[1:])  # later games go on with the streams it started
+    assert all(actions.tolist() == [1] for actions in env.actions)
+
+
+def test_same_seed_same_games():
+    def policy(frames, step, epsilon):
+        return ((frames[:, -1].astype(int).sum((1, 2)) + step) % 3).astype(np.int32)
+
+    env = envs.make("CatchDistractor", num_envs=2, seed=0, frame_size=42, sticky_actions=0.0, noop_max=0)
+    options = {"games": 3, "epsilon": 0.0, "max_steps": 40, "record": True}
+    first, other, again = (evaluate(policy, env, seed=seed, **options) for seed in (5, 6, 5))
+    assert (first.returns, first.lengths) == (again.returns, again.lengths)
+    np.testing.assert_array_equal(first.frames, again.frames)
+    assert not np.array_equal(first.frames, other.frames)
+    env.close()

@@ -1,0 +1,130 @@
+"""What several tests share: an encoder that compiles quickly, random windows, comparisons of trees."""
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from srl_jax.encoders.convolutional import to_unit
+from srl_jax.types import Context, Decoder, Encoder, TrainState, Window
+
+SIZE, STACK, NUM_ACTIONS = 6, 4, 3
+"""Of the frames, observations and actions that the helpers make, unless told otherwise."""
+
+
+def _compiler_options() -> dict:
+    options = {"xla_backend_optimization_level": 0}
+    faster = options | {"xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(lambda x: x, compiler_options=faster)(0.0)
+    except Exception:  # XLA's options come and go; this one halves the time again
+        return options
+    return faster
+
+
+jit = partial(jax.jit, compiler_options=_compiler_options())
+"""For functions that run a few times only: compiles them several times faster."""
+
+
+def make_context(features: int = 8) -> Context:
+    """A linear encoder with a tanh and a linear decoder, and NUM_ACTIONS actions.
+
+    Losses see latents and a decoder, whatever they are made of, and these compile quickly.
+    """
+    shape = (SIZE, SIZE, STACK)
+    pixels = SIZE * SIZE * STACK
+
+    def linear(inputs: int, outputs: int):
+        return lambda key: {"kernel": jax.random.normal(key, (inputs, outputs)) / np.sqrt(inputs)}
+
+    def encode(params, observation):
+        return jnp.tanh(to_unit(observation).reshape(-1, pixels) @ params["kernel"])
+
+    def make_decoder(extra_inputs: int = 0) -> Decoder:
+        decode = lambda params, x: (x @ params["kernel"]).reshape(-1, *shape)  # noqa: E731
+        return Decoder(linear(features + extra_inputs, pixels), decode)
+
+    return Context(Encoder(linear(pixels, features), encode, features, shape, make_decoder), NUM_ACTIONS)
+
+
+def make_window(seed: int = 0, *, batch: int = 4, horizon: int = 3, size: int = SIZE) -> Window:
+    """A random window within one episode: every offset valid, nothing terminal."""
+    rng = np.random.default_rng(seed)
+    shape = (batch, horizon)
+    return Window(
+        frames=rng.integers(0, 256, (batch, STACK + horizon, size, size), dtype=np.uint8),
+        actions=rng.integers(0, NUM_ACTIONS, shape, dtype=np.int32),
+        rewards=rng.normal(size=shape).astype(np.float32),
+        discounts=np.full(shape, 0.99, np.float32),
+        valid=np.ones(shape, np.float32),
+        weight=np.ones(batch, np.float32),
+    )
+
+
+def random_params(init, seed: int = 0):
+    """Parameters of the shapes that `init(key)` gives, without compiling a random draw for every shape."""
+    return fill(jax.eval_shape(init, jax.random.key(0)), seed)
+
+
+def fill(shapes, seed: int = 0):
+    """Normal numbers over the root of the fan-in; LayerNorm's scale is 1, the size of noise 0.02."""
+    rng = np.random.default_rng(seed)
+
+    def draw(path, x):
+        for name, value in (("scale", 1.0), ("sigma", 0.02)):
+            if name in jax.tree_util.keystr(path):
+                return np.full(x.shape, value, np.float32)
+        fan_in = max(1, int(np.prod(x.shape[:-1])))
+        return (rng.normal(size=x.shape) / np.sqrt(fan_in)).astype(np.float32)
+
+    return jax.tree_util.tree_map_with_path(draw, shapes)
+
+
+def random_state(init, seed: int = 0) -> TrainState:
+    """What `init(key)` gives, from `make_init`, with `random_params` in place of the initialisers."""
+    shapes = jax.eval_shape(init, jax.random.key(0))
+    params = fill(shapes.params, seed)
+    return TrainState(
+        params=params,
+        slow={
+            "heads": {name: to_numpy(params["heads"][name]) for name in shapes.slow["heads"]},
+            "encoder": to_numpy(params["encoder"]) if shapes.slow["encoder"] else {},
+        },
+        opt_state=jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes.opt_state),
+        step=np.int32(0),
+        key=jax.random.key(seed),
+    )
+
+
+def count(params) -> int:
+    """How many numbers a tree of arrays (or of their shapes) holds."""
+    return sum(int(np.prod(x.shape)) for x in jax.tree.leaves(params))
+
+
+def to_numpy(tree):
+    """A copy on the host, which outlives the donation of the original."""
+    return jax.tree.map(lambda x: np.array(x), tree)
+
+
+def identical(a, b) -> bool:
+    """Whether two trees have the same form and the same bits."""
+    same = jax.tree.map(np.array_equal, a, b)
+    return all(jax.tree.leaves(same))
+
+
+def all_moved(a, b) -> bool:
+    """Whether every leaf of a tree differs from the other tree's."""
+    differs = jax.tree.map(lambda x, y: not np.array_equal(x, y), a, b)
+    return all(jax.tree.leaves(differs))
+
+
+def all_zero(tree) -> bool:
+    """Whether every number is exactly zero."""
+    return not any(np.any(np.asarray(x)) for x in jax.tree.leaves(tree))
+
+
+def zero_leaves(tree) -> list[str]:
+    """The names of the leaves that are zero throughout."""
+    leaves = jax.tree_util.tree_leaves_with_path(tree)
+    return [jax.tree_util.keystr(path) for path, x in leaves if not np.any(np.asarray(x))]

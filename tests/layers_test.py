@@ -1,0 +1,135 @@
+"""srl_jax/layers.py against plain jax, and numbers worked by hand."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from srl_jax import layers
+from srl_jax.layers import Conv, ConvTranspose, Dense, NoisyDense
+from tests.helpers import jit
+
+
+def transposed(x, kernel, bias, stride, size):
+    """The textbook: zeros between the pixels, a flipped kernel, and padding up to the wanted size."""
+    k = kernel.shape[0]
+    pad = (k - 1, k - 1 + size - ((x.shape[1] - 1) * stride + k))
+    return bias + jax.lax.conv_general_dilated(
+        x, kernel[::-1, ::-1], (1, 1), [pad, pad], lhs_dilation=(stride, stride),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stride", "height", "size"),
+    [
+        (3, 1, 5, 7),
+        (4, 2, 3, 8),
+        (3, 2, 4, 9),
+        (3, 2, 4, 10),  # one row and column that no kernel reaches: the bias alone
+        (8, 4, 3, 19),
+        (6, 4, 4, 20),
+        (2, 3, 3, 9),  # a kernel smaller than its stride: gaps
+        (1, 1, 4, 4),
+    ],
+)
+def test_conv_transpose_is_the_dilated_convolution_in_values_and_gradients(kernel, stride, height, size):
+    layer = ConvTranspose(5, kernel, stride, size)
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(2, height, height, 3)).astype(np.float32)
+    cotangent = rng.normal(size=(2, size, size, 5)).astype(np.float32)
+    params = {
+        "kernel": rng.normal(size=(kernel, kernel, 3, 5)).astype(np.float32),
+        "bias": rng.normal(size=5).astype(np.float32),
+    }
+
+    @jit
+    def both(params, x):
+        ours, pull = jax.vjp(lambda p, x: layer.apply({"params": p}, x), params, x)
+        reference = lambda p, x: transposed(x, p["kernel"], p["bias"], stride, size)  # noqa: E731
+        theirs, reference_pull = jax.vjp(reference, params, x)
+        return (ours, pull(cotangent)), (theirs, reference_pull(cotangent))
+
+    ours, theirs = both(params, x)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), ours, theirs)
+
+
+def test_conv_transpose_by_hand():
+    # Stride 2 and a 2 x 2 kernel: each pixel is multiplied into a block of its own. Size 5 leaves a last
+    # row and column that no kernel reaches. The bias, 0.5, is everywhere.
+    x = np.array([[1.0, 2.0], [3.0, 4.0]], np.float32)[None, :, :, None]
+    kernel = np.array([[1.0, 10.0], [100.0, 1000.0]], np.float32)[:, :, None, None]
+    layer = ConvTranspose(1, 2, 2, 5)
+    y = jit(layer.apply)({"params": {"kernel": kernel, "bias": np.array([0.5], np.float32)}}, x)
+    expected = [
+        [1, 10, 2, 20, 0],
+        [100, 1000, 200, 2000, 0],
+        [3, 30, 4, 40, 0],
+        [300, 3000, 400, 4000, 0],
+        [0, 0, 0, 0, 0],
+    ]
+    np.testing.assert_array_equal(y[0, :, :, 0], np.array(expected) + 0.5)
+
+
+@pytest.mark.parametrize("size", [6, 9])
+def test_conv_transpose_refuses_sizes_that_its_mirror_could_not_have_seen(size):
+    # (3 - 1) * 2 + 3 = 7, and 8 with the pixel that stride 2 drops; nothing else.
+    layer = ConvTranspose(1, 3, 2, size)
+    with pytest.raises(ValueError, match=f"cannot make {size} pixels from 3"):
+        jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, 3, 3, 1)))
+
+
+def test_initialisation_is_uniform_within_one_over_the_root_of_fan_in(monkeypatch):
+    x = np.asarray(layers.uniform_fan_in(25)(jax.random.key(0), (100, 100)))
+    assert np.abs(x).max() <= 0.2
+    assert np.abs(x).max() > 0.199
+    # A uniform distribution on [-b, b] has mean 0 and standard deviation b / sqrt(3).
+    assert abs(x.mean()) < 0.01
+    np.testing.assert_allclose(x.std(), 0.2 / np.sqrt(3), rtol=0.02)
+
+    fans = []
+    monkeypatch.setattr(layers, "uniform_fan_in", lambda n: fans.append(n) or jax.nn.initializers.zeros)
+    cases = [
+        (Dense(7), (1, 25), 25),
+        (NoisyDense(7), (1, 25), 25),
+        (Conv(6, 3, 1), (1, 5, 5, 4), 3 * 3 * 4),
+        (ConvTranspose(6, 3, 1, 7), (1, 5, 5, 4), 3 * 3 * 6),  # PyTorch counts the output side here
+    ]
+    for layer, shape, fan_in in cases:
+        arguments = [None] if isinstance(layer, NoisyDense) else []
+        jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros(shape), *arguments)
+        assert fans.pop() == fan_in and not fans
+
+
+def test_noisy_dense_by_hand():
+    # Two inputs, one output; e = (4, -9, 0.25), so f(e_in) = (2, -3) and f(e_out) = 0.5.
+    # Weights 1 + 0.1 * 2 * 0.5 = 1.1 and 2 + 0.2 * -3 * 0.5 = 1.7; bias 3 + 0.4 * 0.5 = 3.2.
+    params = {
+        "kernel": np.array([[1.0], [2.0]]), "kernel_sigma": np.array([[0.1], [0.2]]),
+        "bias": np.array([3.0]), "bias_sigma": np.array([0.4]),
+    }  # fmt: skip
+    params = jax.tree.map(np.float32, params)
+    apply = jit(lambda x, noise: NoisyDense(1).apply({"params": params}, x, noise))
+    x = np.array([[1, 0], [0, 1], [10, 1]], np.float32)
+    y = apply(x, np.array([4, -9, 0.25], np.float32))
+    np.testing.assert_allclose(y[:, 0], [1.1 + 3.2, 1.7 + 3.2, 11 + 1.7 + 3.2], rtol=1e-6)
+    # Without noise the means.
+    np.testing.assert_allclose(apply(x, None)[:, 0], [4, 5, 15], rtol=1e-6)
+
+
+def test_noisy_dense_noise_is_one_outer_product_in_the_size_of_its_sigmas():
+    inputs, outputs, std = 30, 20, 0.4
+    layer = NoisyDense(outputs, std)
+    params = layer.init(jax.random.key(1), jnp.zeros((1, inputs)), None)["params"]
+    sigma = std / np.sqrt(inputs)
+    np.testing.assert_allclose(params["kernel_sigma"], np.full((inputs, outputs), sigma), rtol=1e-6)
+    np.testing.assert_allclose(params["bias_sigma"], np.full(outputs, sigma), rtol=1e-6)
+
+    # The weights that act, read off by probing: zero shows the bias, the unit vectors the kernel.
+    probe = np.concatenate([np.zeros((1, inputs)), np.eye(inputs)]).astype(np.float32)
+    e = np.random.default_rng(0).normal(size=inputs + outputs).astype(np.float32)
+    y = np.asarray(jit(layer.apply)({"params": params}, probe, e), np.float64)
+    f = np.sign(e) * np.sqrt(np.abs(e))
+    np.testing.assert_allclose((y[0] - params["bias"]) / sigma, f[inputs:], atol=1e-4)
+    noise = (y[1:] - y[0] - params["kernel"]) / sigma
+    np.testing.assert_allclose(noise, np.outer(f[:inputs], f[inputs:]), atol=1e-4)

@@ -1,0 +1,185 @@
+"""The loop: schedules, files and reproducibility of whole short runs on Catch."""
+
+import json
+
+import numpy as np
+import pytest
+
+from srl_jax import checkpoint, loop
+from srl_jax.config import Config
+from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.specs import ConfigError
+
+SMALL = {
+    "game": "Catch",
+    "frame_size": 42,
+    "encoder": "tiny:features=8",
+    "rl": "rainbow:hidden=16,atoms=11,v_min=-2,v_max=2",
+    "num_envs": 4,
+    "buffer_size": 400,
+    "batch_size": 8,
+    "learn_start": 40,
+    "updates_per_step": 0.125,
+    "steps": 240,
+    "log_every": 40,
+    "eval_every": 120,
+    "eval_games": 3,
+    "slow_update_every": 5,
+}
+JOINT = {"mode": "joint", "objectives": ("reconstruction", "latent_l2")}
+
+
+def train(path, **values):
+    path.mkdir()
+    config = Config(**{**SMALL, **values})
+    config.save(path)
+    return loop.train(config, path, progress=False)
+
+
+@pytest.fixture(scope="module")
+def joint(tmp_path_factory):
+    """One joint run that the tests below look at, and start from."""
+    path = tmp_path_factory.mktemp("runs") / "joint"
+    return path, train(path, **JOINT, seed=3)
+
+
+def test_same_seed_same_metrics(joint, tmp_path):
+    path, _ = joint
+    train(tmp_path / "again", **JOINT, seed=3)
+    train(tmp_path / "other", **JOINT, seed=4)
+
+    def rows(p):
+        return [strip_wall(row) for row in read_metrics(p / "metrics.jsonl")]
+
+    assert rows(path) == rows(tmp_path / "again")
+    assert rows(path) != rows(tmp_path / "other")
+    first, second = (checkpoint.read_manifest(p).files for p in (path, tmp_path / "again"))
+    assert first == second  # the same sha256: parameters are bit-identical
+
+
+def test_rows_of_a_run(joint):
+    path, result = joint
+    rows = read_metrics(path / "metrics.jsonl")
+    train_rows = [row for row in rows if row["kind"] == "train"]
+    assert [row["env_steps"] for row in train_rows] == [40, 80, 120, 160, 200, 240]
+    assert [row["env_steps"] for row in rows if row["kind"] == "eval"] == [0, 120, 240]
+    # Learning starts at 40 env steps; the step from 40 to 44 brings the first half of an update.
+    # By 240 there are (240 - 40) * 0.125 = 25.
+    assert result.updates == rows[-1]["updates"] == 25
+    assert train_rows[0]["updates"] == 0 and "loss/rl" not in train_rows[0]
+    last = train_rows[-1]
+    names = {"loss/rl", "loss/reconstruction", "loss/latent_l2", "loss/total", "grad_norm", "rl/q_max_mean"}
+    assert names | {"epsilon", "beta", "wall_steps_per_s"} <= set(last)
+    # epsilon: 1 - 0.95 * 240 / 1,000,000
+    assert last["epsilon"] == pytest.approx(1 - 0.95 * 240e-6)
+    evaluation = rows[-1]
+    assert evaluation["kind"] == "eval" and len(evaluation["eval/returns"]) == 3
+    assert evaluation["eval/return_mean"] == pytest.approx(np.mean(evaluation["eval/returns"]))
+    assert all(17 <= length <= 24 for length in evaluation["eval/lengths"])
+
+
+def test_pictures_show_input_target_and_output(joint):
+    _, result = joint
+    (inputs, targets, outputs) = result.pictures["reconstruction"]
+    assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 42, 4)
+    np.testing.assert_allclose(inputs, targets, atol=1e-7)  # reconstruction's target is its input
+    assert 0 <= inputs.min() and inputs.max() <= 1
+
+
+def test_an_agent_comes_back_from_its_checkpoint(joint):
+    path, _ = joint
+    agent, params, manifest = loop.load_agent(path)
+    assert (manifest.env_steps, manifest.updates) == (240, 25)
+    assert set(params["heads"]) == {"rl", "reconstruction", "latent_l2"}
+    assert set(agent.objectives) == {"rl", "reconstruction", "latent_l2"}
+
+
+@pytest.mark.parametrize("mode", ["frozen", "finetuned", "joint", "decoupled"])
+def test_starting_from_an_encoder(joint, tmp_path, mode):
+    source, _ = joint
+    values = {"objectives": JOINT["objectives"]} if mode in ("joint", "decoupled") else {}
+    # No update happens before 200 env steps, so the encoder written at 120 is the one it began with.
+    run = tmp_path / mode
+    train(run, mode=mode, encoder_from=str(source), learn_start=200, **values)
+    started = checkpoint.load(checkpoint.read_manifest(run / "checkpoints" / "000000120"))["encoder"]
+    given = checkpoint.load(checkpoint.read_manifest(source))["encoder"]
+    ended = checkpoint.load(checkpoint.read_manifest(run))["encoder"]
+
+    def same(a, b):
+        return all(np.array_equal(a[layer][name], b[layer][name]) for layer in given for name in given[layer])
+
+    assert same(given, started)
+    assert same(given, ended) == (mode == "frozen")
+
+
+def test_pretraining_on_a_given_policy_and_on_a_random_one(joint, tmp_path):
+    source, _ = joint
+    train(tmp_path / "random", mode="pretrain", objectives=("inverse",))
+    train(tmp_path / "given", mode="pretrain", objectives=("inverse",), policy_from=str(source))
+    rows = [read_metrics(tmp_path / name / "metrics.jsonl") for name in ("random", "given")]
+    for mode_rows in rows:
+        assert {row["kind"] for row in mode_rows} == {"train"}
+        assert "loss/inverse" in mode_rows[-1] and "loss/rl" not in mode_rows[-1]
+    assert [rows[0][-1]["epsilon"], rows[1][-1]["epsilon"]] == [1.0, 0.3]
+    # Such a run starts another one, but has no policy to give.
+    train(tmp_path / "frozen", mode="frozen", encoder_from=str(tmp_path / "random"))
+    config = Config(**SMALL, mode="pretrain", objectives=("inverse",), policy_from=str(tmp_path / "random"))
+    with pytest.raises(ConfigError, match="has no policy"):
+        checkpoint.check_sources(config)
+
+
+def test_an_encoder_that_does_not_fit_is_refused(joint):
+    source, _ = joint
+    for field, value in (("encoder", "tiny:features=16"), ("frame_size", 84), ("frame_stack", 2)):
+        config = Config(**{**SMALL, "mode": "frozen", "encoder_from": str(source), field: value})
+        with pytest.raises(ConfigError, match=f"{field} is .* there and .* here"):
+            checkpoint.check_sources(config)
+
+
+def test_ctrl_c_saves_and_says_so(tmp_path, monkeypatch):
+    original = loop.Replay.add
+
+    def add(self, *arguments):
+        original(self, *arguments)
+        if self.num_transitions >= 100:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(loop.Replay, "add", add)
+    result = train(tmp_path / "run", **JOINT)
+    # The step from 96 to 100 was being added; it does not count.
+    assert result.interrupted and result.env_steps == 96
+    assert checkpoint.read_manifest(tmp_path / "run").env_steps == 96
+    assert "reconstruction" in result.pictures
+
+
+def test_early_stop(tmp_path):
+    result = train(tmp_path / "run", stop_at_return=-1.0)
+    assert result.env_steps == 0  # every return is at least -1
+    assert checkpoint.read_manifest(tmp_path / "run").env_steps == 0
+
+
+def test_updates_are_compiled_once(joint):
+    del joint
+    run = loop._Run(Config(**SMALL), None, False)
+    from srl_jax.replay import Window  # the type that replay gives
+
+    run.replay.begin(run.env.reset()[0])
+    for _ in range(30):
+        out = run.env.step(np.ones(4, np.int32))
+        over = out[2] | out[3]
+        run.replay.add(np.ones(4, np.int32), out[1], out[2], out[3], out[4]["life_lost"], out[0])
+        if over.any():
+            frames, _ = run.env.reset(options={"reset_mask": over})
+            run.replay.begin(frames[over], np.flatnonzero(over))
+    for _ in range(3):
+        run.launch_update()
+        run.finish_updates()
+    assert isinstance(run.replay.sample(2, 0.5)[0], Window)
+    assert run.agent.update._cache_size() == 1
+
+
+def test_config_is_data(joint):
+    path, _ = joint
+    values = json.loads((path / "config.json").read_text())
+    assert Config.load(path).seed == values["seed"] == 3
+    assert values["versions"]["jax"]

@@ -1,0 +1,164 @@
+"""srl_jax/modes.py and agent.py: the mode x parameter-group matrix, of small but real runs."""
+
+import functools
+
+import jax
+import numpy as np
+import pytest
+
+from srl_jax.agent import make_agent
+from srl_jax.config import Config
+from srl_jax.modes import MODES
+from srl_jax.optim import RL
+from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_window, random_state
+
+TERMS = ("reconstruction", "inverse")
+MOVES = {  # in two updates; all other groups of the mode stay bit-identical
+    "rl_only": {"encoder", RL},
+    "pretrain": {"encoder", *TERMS},
+    "frozen": {RL},
+    "finetuned": {"encoder", RL},
+    "joint": {"encoder", RL, *TERMS},
+    "decoupled": {"encoder", RL, *TERMS},
+}
+FRAME = 18  # the smallest that the tiny encoder takes
+WINDOW = make_window(size=FRAME)
+
+
+@functools.cache
+def build(mode):
+    """(agent, its update compiled quickly, an initial state on the host) of a small real configuration."""
+    config = Config(
+        mode=mode,
+        frame_size=FRAME,
+        encoder="tiny:features=8",
+        rl="rainbow:noisy=false,hidden=8,atoms=5,n_step=3",
+        objectives=tuple(f"{name}:weight=0.5" for name in TERMS) if MODES[mode].representation else (),
+        slow_update_every=2,
+        lr_rl=1e-3,
+        lr_srl=2e-3,
+    )
+    agent = make_agent(config, NUM_ACTIONS)
+    return agent, jit(agent.update.__wrapped__), random_state(agent.init)
+
+
+def groups(params):
+    return ({"encoder": params["encoder"]} if params["encoder"] else {}) | params["heads"]
+
+
+@functools.cache
+def two_updates(mode):
+    """The states before, between and after, and the metrics of the first."""
+    agent, update, state = build(mode)
+    first, _, metrics = update(state, WINDOW, agent.hyper)
+    second, _, _ = update(first, WINDOW, agent.hyper)
+    return state, first, second, metrics
+
+
+def test_the_matrix_knows_every_mode():
+    assert set(MOVES) == set(MODES)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_what_should_move_moves_and_the_rest_is_bit_identical(mode):
+    before, _, after, metrics = two_updates(mode)
+    present = {RL} if MODES[mode].rl else set()
+    present |= set(TERMS) if MODES[mode].representation else set()
+    assert set(groups(before.params)) == {"encoder"} | present
+    for name, start in groups(before.params).items():
+        end = groups(after.params)[name]
+        assert (all_moved if name in MOVES[mode] else identical)(start, end), name
+    assert {name for name in metrics if name.startswith("loss/")} == {"loss/total"} | {
+        f"loss/{name}" for name in present
+    }
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_slow_copies_are_replaced_every_second_update_and_stay_in_between(mode):
+    before, between, after, _ = two_updates(mode)
+    if not MODES[mode].rl:
+        assert before.slow == after.slow == {"heads": {}, "encoder": {}}
+        return
+    assert set(groups(before.slow)) == {"encoder", RL}
+    assert identical(before.slow, between.slow)
+    for name in ("encoder", RL):
+        assert identical(groups(after.slow)[name], groups(after.params)[name])
+        # the newest, not the one before it (which a frozen encoder cannot tell)
+        before_copy = groups(between.params)[name]
+        assert identical(groups(after.slow)[name], before_copy) == (name not in MOVES[mode])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_optimizer_keeps_state_for_what_moves_alone(mode):
+    state, _, after, _ = two_updates(mode)
+    names = [jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(state.opt_state)]
+    for name in ("encoder", RL, *TERMS):
+        assert any(f"'{name}'" in leaf for leaf in names) == (name in MOVES[mode]), name
+    assert int(after.step) == 2
+
+
+def test_the_encoder_learns_at_the_rate_of_its_trainer():
+    rates = {
+        "rl_only": 1e-3,
+        "pretrain": 2e-3,
+        "frozen": 0,
+        "finetuned": 1e-3,
+        "joint": 1e-3,
+        "decoupled": 2e-3,
+    }
+    for mode, rate in rates.items():
+        agent, _, _ = build(mode)
+        found = {group: float(x) for group, x in agent.hyper.learning_rates.items()}
+        assert found == pytest.approx({"encoder": rate, "rl": 1e-3, "representation": 2e-3}), mode
+
+
+def test_decoupled_rl_gradient_never_enters_the_encoder():
+    weights = {RL: np.float32(100)}
+    for mode, same in (("decoupled", True), ("joint", False)):
+        agent, update, state = build(mode)
+        heavy = agent.hyper._replace(weights=agent.hyper.weights | weights)
+        ours, theirs = (update(state, WINDOW, hyper)[0].params for hyper in (agent.hyper, heavy))
+        assert identical(ours["encoder"], theirs["encoder"]) == same
+        assert identical(ours["heads"]["inverse"], theirs["heads"]["inverse"])
+        assert not identical(ours["heads"][RL], theirs["heads"][RL])
+
+
+def test_decoupled_trains_its_encoder_as_pretraining_does():
+    # The same starts, names and losses: what RL adds beside them must not show in the encoder.
+    (_, _, decoupled, _), (_, _, pretrain, _), (_, _, joint, _) = map(
+        two_updates, ("decoupled", "pretrain", "joint")
+    )
+    close = lambda a, b: all(  # noqa: E731
+        np.allclose(x, y, atol=1e-5) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True)
+    )
+    assert close(decoupled.params["encoder"], pretrain.params["encoder"])
+    assert not close(joint.params["encoder"], pretrain.params["encoder"])
+
+
+def test_the_total_is_the_weighted_sum_of_means():
+    agent, update, state = build("joint")
+    weights = {RL: np.float32(0.25), "reconstruction": np.float32(3), "inverse": np.float32(0)}
+    _, _, metrics = update(state, WINDOW, agent.hyper._replace(weights=weights))
+    expected = sum(weight * float(metrics[f"loss/{name}"]) for name, weight in weights.items())
+    np.testing.assert_allclose(metrics["loss/total"], expected, rtol=1e-5)
+    assert {name: float(w) for name, w in agent.hyper.weights.items()} == {RL: 1, **dict.fromkeys(TERMS, 0.5)}
+
+
+def test_importance_weights_multiply_the_rl_loss_alone():
+    agent, update, state = build("joint")
+    light = WINDOW._replace(weight=np.full_like(WINDOW.weight, 0.25))
+    (_, td_error, metrics), (_, light_td_error, light_metrics) = (
+        update(state, window, agent.hyper) for window in (WINDOW, light)
+    )
+    assert td_error.shape == WINDOW.weight.shape
+    np.testing.assert_array_equal(td_error, light_td_error)
+    for name in (RL, *TERMS):
+        factor = 0.25 if name == RL else 1.0
+        np.testing.assert_allclose(light_metrics[f"loss/{name}"], factor * metrics[f"loss/{name}"], rtol=1e-6)
+
+
+def test_no_td_error_without_rl():
+    agent, update, state = build("pretrain")
+    _, td_error, metrics = update(state, WINDOW, agent.hyper)
+    assert td_error is None
+    assert "inverse/accuracy" in metrics and "grad_norm" in metrics

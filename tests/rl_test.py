@@ -1,0 +1,257 @@
+"""srl_jax/rl: the algorithms against a network in numpy and rlax's losses; what every row has to keep is in
+objectives_test.py."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import rlax
+
+from srl_jax import rl
+from srl_jax.types import Context, Encoder, Latents, Window
+from tests.helpers import all_zero, count, jit, random_params
+
+pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:PendingDeprecationWarning")
+
+BATCH, FEATURES, ACTIONS, ATOMS = 6, 5, 3, 7
+CONTEXT = Context(Encoder(None, None, FEATURES, (1, 1, 4), None), ACTIONS)
+SMALL = {"hidden": 8, "atoms": ATOMS, "v_min": -2.0, "v_max": 4.0}
+
+
+def make_latents(online, slow):
+    """Latents out of tables, float32 [K + 1, B, D]."""
+
+    def table(z):
+        z = jnp.asarray(z)
+        return lambda k: z[k] if isinstance(k, int) else z[k, np.arange(BATCH)]
+
+    return Latents(table(online), table(slow))
+
+
+def make_case(seed=0):
+    """Tables of latents, and a window of 3 steps.
+
+    Its rows: whole, terminal after 1, 2 and 3 steps, truncated after 1 and 2.
+    """
+    rng = np.random.default_rng(seed)
+    online, slow = rng.normal(size=(2, 4, BATCH, FEATURES)).astype(np.float32)
+    rewards = rng.normal(size=(BATCH, 3))
+    discounts = np.full((BATCH, 3), 0.9)
+    valid = np.ones((BATCH, 3))
+    for row, steps in ((1, 1), (2, 2), (3, 3)):
+        discounts[row, steps - 1] = 0
+        valid[row, steps:] = 0
+    for row, steps in ((4, 1), (5, 2)):
+        valid[row, steps:] = 0
+    actions = rng.integers(0, ACTIONS, (BATCH, 3), dtype=np.int32)
+    rewards, discounts = rewards * valid, discounts * valid
+    weight = rng.random(BATCH)
+    floats = [x.astype(np.float32) for x in (rewards, discounts, valid, weight)]
+    return online, slow, Window(np.zeros((BATCH, 7, 1, 1), np.uint8), actions, *floats)
+
+
+def network(head, z, dueling, noise=None):
+    """The head in numpy: [B, A, M]; with the noise of its layers in turn, float32 [any]."""
+    noise = None if noise is None else list(noise)
+
+    def layer(name, x):
+        kernel, bias = head[name]["kernel"], head[name]["bias"]
+        if noise is not None:
+            e = np.array([noise.pop(0) for _ in range(sum(kernel.shape))])
+            f = np.sign(e) * np.sqrt(np.abs(e))
+            kernel = kernel + head[name]["kernel_sigma"] * np.outer(f[: len(kernel)], f[len(kernel) :])
+            bias = bias + head[name]["bias_sigma"] * f[len(kernel) :]
+        return x @ kernel + bias
+
+    def stream(name, outputs):
+        x = layer(f"{name}_out", np.maximum(layer(f"{name}_hidden", z), 0))
+        return x.reshape(len(z), outputs, -1)
+
+    q = stream("q", ACTIONS)
+    return q - q.mean(1, keepdims=True) + stream("v", 1) if dueling else q
+
+
+def softmax(x):
+    x = np.exp(x - x.max(-1, keepdims=True))
+    return x / x.sum(-1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("distributional", "double", "dueling", "n_step"),
+    [(True, True, True, 3), (True, False, False, 2), (False, True, False, 3), (False, False, True, 1)],
+)
+def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step):
+    parts = {"distributional": distributional, "double": double, "dueling": dueling, "n_step": n_step}
+    algorithm = rl.rainbow(CONTEXT, noisy=False, **parts, **SMALL)
+    objective = algorithm.objective
+    head, slow_head = (random_params(objective.init, seed) for seed in (1, 2))
+    online, slow, window = make_case()
+
+    @jit
+    def run(head, slow_head, online, slow, key):
+        latents = make_latents(online, slow)
+        return (
+            *objective.loss(head, slow_head, latents, window, key),
+            algorithm.q_values(head, latents.online(0)),
+        )
+
+    losses, metrics, q_values = run(head, slow_head, online, slow, jax.random.key(0))
+
+    atoms = np.linspace(-2, 4, ATOMS, dtype=np.float32)
+    expected = lambda out: softmax(out) @ atoms if distributional else out[..., 0]  # noqa: E731
+    td_error = []
+    for b in range(BATCH):
+        total, discount, offset = 0.0, 1.0, 0
+        while offset < n_step and window.valid[b, offset]:
+            total += discount * window.rewards[b, offset]
+            discount *= window.discounts[b, offset]
+            offset += 1
+        out_tm1 = network(head, online[0], dueling)[b]
+        slow_t = network(slow_head, slow[offset], dueling)[b]
+        selector = expected(network(head, online[offset], dueling)[b] if double else slow_t)
+        action, total, discount = window.actions[b, 0], jnp.float32(total), jnp.float32(discount)
+        if distributional:
+            loss = rlax.categorical_double_q_learning(
+                atoms, out_tm1, action, total, discount, atoms, slow_t, jnp.asarray(selector)
+            )
+        else:
+            loss = rlax.double_q_learning(
+                out_tm1[:, 0], action, total, discount, jnp.asarray(slow_t[:, 0]), jnp.asarray(selector)
+            )
+        td_error.append(float(loss))
+    td_error = np.array(td_error)
+    unweighted = td_error if distributional else np.asarray(rlax.huber_loss(td_error))
+
+    np.testing.assert_allclose(q_values, expected(network(head, online[0], dueling)), rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(metrics["td_error"], td_error, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(losses, unweighted * window.weight, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(metrics["q_max_mean"], q_values.max(-1).mean(), rtol=1e-5)
+
+
+def test_gradient_flows_through_the_sampled_state_alone():
+    # With double Q-learning, the online network also sees the state bootstrapped from.
+    algorithm = rl.rainbow(CONTEXT, noisy=False, **SMALL)
+    head, slow_head = (random_params(algorithm.objective.init, seed) for seed in (1, 2))
+    online, slow, window = make_case()
+
+    def mean(online, slow, slow_head):
+        latents = make_latents(online, slow)
+        losses, _ = algorithm.objective.loss(head, slow_head, latents, window, jax.random.key(0))
+        return jnp.mean(losses)
+
+    of_online, *of_slow = jit(jax.grad(mean, (0, 1, 2)))(online, slow, slow_head)
+    assert np.all(np.any(of_online[0], -1))  # every row's s_t
+    assert all_zero(of_online[1:])
+    assert all_zero(of_slow)
+
+
+def test_noise_needs_a_key_and_differs_between_the_networks():
+    plain = {"distributional": False, "double": False, "dueling": False, "n_step": 1, "hidden": 8}
+    algorithm = rl.rainbow(CONTEXT, **plain)
+    head = random_params(algorithm.objective.init)
+    online, _, window = make_case()
+    # Every state's latents are the same, rewards are 0 and nothing is discounted. The slow network is the
+    # online one. Where the action taken is the best one, only the noise is between the two values.
+    still = np.broadcast_to(online[:1], online.shape)
+    ones = np.ones_like(window.rewards)
+
+    @jit
+    def run(head, key):
+        q = algorithm.q_values(head, still[0])
+        noisy = algorithm.q_values(head, still[0], key)
+        actions = jnp.argmax(q, -1)[:, None] * jnp.ones((1, 3), int)
+        w = window._replace(rewards=0 * ones, discounts=ones, valid=ones, actions=actions)
+        _, metrics = algorithm.objective.loss(head, head, make_latents(still, still), w, key)
+        return q, noisy, metrics["td_error"]
+
+    q, noisy, td_error = run(head, jax.random.key(0))
+    same_q, other, _ = run(head, jax.random.key(1))
+    np.testing.assert_array_equal(q, same_q)
+    assert not np.allclose(q, noisy) and not np.allclose(noisy, other)
+    assert np.all(td_error != 0)
+    silent = jax.tree_util.tree_map_with_path(
+        lambda path, x: 0 * x if "sigma" in jax.tree_util.keystr(path) else x, head
+    )
+    q, noisy, td_error = run(silent, jax.random.key(0))
+    np.testing.assert_allclose(noisy, q, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(td_error, np.zeros(BATCH), atol=1e-5)
+
+
+@pytest.mark.parametrize("dueling", [True, False])
+def test_every_layer_has_noise_of_its_own_cut_from_one_draw(dueling):
+    algorithm = rl.rainbow(CONTEXT, distributional=False, dueling=dueling, hidden=8)
+    head, key = random_params(algorithm.objective.init), jax.random.key(5)
+    (z, *_), *_ = make_case()
+    lengths = [FEATURES + 8, 8 + ACTIONS] + ([FEATURES + 8, 8 + 1] if dueling else [])
+    noise = jax.random.normal(key, (sum(lengths),))
+    expected = network(head, z, dueling, np.asarray(noise))[..., 0]
+    np.testing.assert_allclose(jit(algorithm.q_values)(head, z, key), expected, rtol=1e-4, atol=1e-5)
+
+
+def leaf_names(algorithm):
+    shapes = jax.eval_shape(algorithm.objective.init, jax.random.key(0))
+    return {jax.tree_util.keystr(path): x.shape for path, x in jax.tree_util.tree_leaves_with_path(shapes)}
+
+
+@pytest.mark.parametrize("part", ["distributional", "double", "dueling", "noisy", "prioritized", "n_step"])
+def test_every_part_can_be_left_out_alone(part):
+    whole = rl.rainbow(CONTEXT)
+    less = rl.rainbow(CONTEXT, **{part: 1 if part == "n_step" else False})
+    changed = {name for name in ("leaves", "horizon", "alpha") if facts(whole)[name] != facts(less)[name]}
+    # What shows from outside; the effect of double is in the loss, above.
+    shows = {"double": set(), "prioritized": {"alpha"}, "n_step": {"horizon"}}
+    assert changed == shows.get(part, {"leaves"})
+    names = leaf_names(less)
+    assert any("sigma" in name for name in names) == (part != "noisy")
+    assert any("v_out" in name for name in names) == (part != "dueling")
+    atoms = 1 if part == "distributional" else 51
+    assert names["['q_out']['bias']"] == (ACTIONS * atoms,)
+
+
+def facts(algorithm):
+    return {"leaves": leaf_names(algorithm), "horizon": algorithm.objective.horizon, "alpha": algorithm.alpha}
+
+
+def test_rows_are_what_their_names_say():
+    rows = {name: factory(CONTEXT) for name, factory in rl.REGISTRY.items()}
+    for name in ("dqn", "double", "c51"):
+        assert rows[name].objective.horizon == 1 and rows[name].alpha == 0.0
+        outputs = 51 if name == "c51" else 1
+        hidden, out = FEATURES * 512 + 512, 512 * ACTIONS * outputs + ACTIONS * outputs
+        assert sum(np.prod(shape) for shape in leaf_names(rows[name]).values()) == hidden + out
+    assert rows["rainbow"].objective.horizon == 3 and rows["rainbow"].alpha == 0.5
+    assert rl.rainbow(CONTEXT, alpha=0.7).alpha == 0.7
+    # dqn and double have the same network; they differ in who chooses the action bootstrapped from.
+    head, slow_head = (random_params(rows["dqn"].objective.init, seed) for seed in (1, 2))
+    online, slow, window = make_case()
+
+    @jit
+    def losses(online, slow):
+        arguments = head, slow_head, make_latents(online, slow), window, jax.random.key(0)
+        return [rows[name].objective.loss(*arguments)[0] for name in ("dqn", "double")]
+
+    assert not np.allclose(*losses(online, slow))
+
+
+def test_head_of_the_thesis_has_its_size():
+    # On nature's 3,136 features, 6 actions: each stream 3136 * 512 + 512 = 1,606,144, then 512 * 306 + 306 =
+    # 156,978 and 512 * 51 + 51 = 26,163; all of it twice, since every weight has its sigma.
+    context = Context(Encoder(None, None, 3136, (84, 84, 4), None), 6)
+    shapes = jax.eval_shape(rl.rainbow(context).objective.init, jax.random.key(0))
+    assert count(shapes) == 2 * (2 * 1_606_144 + 156_978 + 26_163)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"n_step": 0}, "n_step"),
+        ({"hidden": 0}, "hidden"),
+        ({"atoms": 1}, "atoms"),
+        ({"v_min": 1.0, "v_max": 1.0}, "v_min must be below v_max"),
+    ],
+)
+def test_options_that_cannot_be_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        rl.rainbow(CONTEXT, **options)
+    if "n_step" not in options and "hidden" not in options:  # the support matters only where there is one
+        rl.rainbow(CONTEXT, distributional=False, **options)

@@ -1,0 +1,294 @@
+"""srl_jax/update.py: what each loss sees, how slow copies follow, how an action is chosen."""
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from srl_jax.augment import random_shift
+from srl_jax.modes import MODES
+from srl_jax.optim import RL, make_optimizer
+from srl_jax.types import Encoder, Objective
+from srl_jax.update import Hyper, make_act, make_init, make_latents, make_update, named_key, periodic, shift
+from srl_jax.window import observation
+from tests.helpers import all_moved, identical, jit, make_window, to_numpy
+
+
+def make_peek(weight=1.0, **options):
+    """An objective of one number, whose metrics are its view, its latents and a draw of its key."""
+
+    def loss(head, slow_head, latents, window, key):
+        metrics = {
+            "frames": window.frames,
+            "online": latents.online(0),
+            "slow": latents.slow(0),
+            "noise": jax.random.normal(key, (3,)),
+        }
+        losses = jnp.mean(latents.online(0) ** 2, -1) + jnp.sum(head["w"] ** 2)
+        return losses, metrics
+
+    return Objective(lambda key: {"w": jax.random.normal(key, (3,))}, loss, weight, **options)
+
+
+PIXELS = Encoder(  # its latent is the observation itself, times a number
+    init=lambda key: {"scale": 1 + jax.random.uniform(key, (1,))},
+    apply=lambda params, x: params["scale"] * (x.astype(jnp.float32) / 255).reshape(len(x), -1),
+    features=6 * 6 * 4,
+    observation_shape=(6, 6, 4),
+    make_decoder=None,
+)
+SMALL = make_window()
+RATES = dict.fromkeys(("encoder", RL, "representation"), np.float32(0.1))
+
+
+def make_peeks(*names, mode="joint", every=2, **options):
+    """(init, update, hyper) of peeks by name; RL's has a slow copy."""
+    terms = {name: make_peek(slow=periodic(every) if name == RL else None) for name in names}
+    optimizer = make_optimizer(terms)
+    starts = {n: v for n, v in options.items() if n == "target_encoder"}
+    init = make_init(PIXELS, terms, MODES[mode], optimizer, **starts)
+    update = make_update(PIXELS, terms, MODES[mode], optimizer, **options)
+    return init, update, Hyper(dict.fromkeys(names, np.float32(1)), RATES)
+
+
+_shift = jit(shift)
+
+
+def test_each_augmentation_and_who_sees_it():
+    key = jax.random.key(3)
+    shifted = np.asarray(_shift(SMALL, named_key(jax.random.fold_in(key, 0), "augment")).frames)
+    assert not any(np.array_equal(*pair) for pair in zip(shifted, SMALL.frames, strict=True))
+    views = {"none": (SMALL.frames, SMALL.frames), "srl": (SMALL.frames, shifted), "all": (shifted, shifted)}
+    for augment, (rl_view, representation_view) in views.items():
+        init, update, hyper = make_peeks(RL, "peek", augment=augment)
+        _, _, metrics = jit(update)(init(key), SMALL, hyper)
+        for name, view in ((RL, rl_view), ("peek", representation_view)):
+            np.testing.assert_array_equal(metrics[f"{name}/frames"], view, err_msg=f"{augment} {name}")
+            # The latents are those of the same view.
+            pixels = observation(SMALL._replace(frames=view), 0).reshape(len(view), -1) / 255
+            for which in ("online", "slow"):
+                scale = init(key).params["encoder"]["scale"]
+                np.testing.assert_allclose(metrics[f"{name}/{which}"], pixels * scale, rtol=1e-5)
+
+
+def test_each_row_has_a_shift_of_its_own():
+    same = SMALL._replace(frames=np.broadcast_to(SMALL.frames[:1], SMALL.frames.shape))
+    rows = [row for seed in range(5) for row in np.asarray(_shift(same, jax.random.key(seed)).frames)]
+    assert len({row.tobytes() for row in rows}) > 12  # 20 draws of 81 shifts
+    one = jit(random_shift)(same.frames[2], jax.random.split(jax.random.key(0), 4)[2])
+    np.testing.assert_array_equal(rows[2], one)  # the whole row, all its frames, by one draw
+
+
+def test_another_objective_changes_no_ones_noise_or_start():
+    key = jax.random.key(1)
+    alone, together = make_peeks(RL), make_peeks("first", RL, "peek")
+    states = [init(key) for init, _, _ in (alone, together)]
+    for tree in ("params", "slow"):
+        ours, theirs = (getattr(state, tree) for state in states)
+        assert identical(ours["encoder"], theirs["encoder"])
+        assert identical(ours["heads"][RL], theirs["heads"][RL])
+    heads = states[1].params["heads"]
+    assert not np.array_equal(heads["first"]["w"], heads["peek"]["w"])
+
+    ours, theirs = (
+        jit(update)(state, SMALL, hyper)[2]
+        for state, (_, update, hyper) in zip(states, (alone, together), strict=True)
+    )
+    np.testing.assert_array_equal(ours[f"{RL}/noise"], theirs[f"{RL}/noise"])
+    noises = {theirs[f"{name}/noise"].tobytes() for name in ("first", RL, "peek")}
+    assert len(noises) == 3
+
+
+def test_noise_differs_between_updates_and_seeds():
+    init, update, hyper = make_peeks(RL)
+    update = jit(update)
+    noises = []
+    for seed in (0, 1):
+        state = init(jax.random.key(seed))
+        for _ in range(3):
+            state, _, metrics = update(state, SMALL, hyper)
+            noises.append(np.asarray(metrics[f"{RL}/noise"]).tobytes())
+    assert len(set(noises)) == 6
+
+
+@pytest.mark.parametrize("target_encoder", ["slow", "online"])
+def test_target_encoder(target_encoder):
+    init, update, hyper = make_peeks(RL, every=3, target_encoder=target_encoder)
+    update, state = jit(update), init(jax.random.key(0))
+    assert (state.slow["encoder"] == {}) == (target_encoder == "online")
+    start = state.params["encoder"]["scale"]
+    pixels = observation(SMALL, 0).reshape(len(SMALL.frames), -1) / 255
+    for i in range(4):
+        scale = state.params["encoder"]["scale"]
+        state, _, metrics = update(state, SMALL, hyper)
+        np.testing.assert_allclose(metrics[f"{RL}/online"], pixels * scale, rtol=1e-5)
+        # Three updates on the first copy; the fourth sees the one that the third made.
+        lagged = scale if target_encoder == "online" or i == 3 else start
+        np.testing.assert_allclose(metrics[f"{RL}/slow"], pixels * lagged, rtol=1e-5)
+
+
+def test_no_gradient_through_the_target_encoder():
+    # A loss of the slow latents alone: nothing but the head, which has no gradient either, could move.
+    def loss(head, slow_head, latents, window, key):
+        return jnp.sum(latents.slow(0), -1) * head["w"], {}
+
+    objective = Objective(lambda key: {"w": jnp.ones(())}, loss, slow=periodic(10))
+    for target_encoder in ("slow", "online"):
+        terms, options = {RL: objective}, {"target_encoder": target_encoder}
+        optimizer = make_optimizer(terms)
+        state = make_init(PIXELS, terms, MODES["joint"], optimizer, **options)(jax.random.key(0))
+        update = make_update(PIXELS, terms, MODES["joint"], optimizer, **options)
+        after, _, _ = jit(update)(state, SMALL, Hyper({RL: 1.0}, RATES))
+        assert identical(state.params["encoder"], after.params["encoder"])
+        assert not identical(state.params["heads"], after.params["heads"])
+
+
+def test_an_objective_may_have_a_slow_copy_of_its_own_rule():
+    average = lambda new, old, step: jax.tree.map(lambda n, o: 0.5 * n + 0.5 * o, new, old)  # noqa: E731
+    terms = {RL: make_peek(slow=periodic(100)), "peek": make_peek(slow=average)}
+    optimizer = make_optimizer(terms)
+    before = make_init(PIXELS, terms, MODES["joint"], optimizer)(jax.random.key(0))
+    update = make_update(PIXELS, terms, MODES["joint"], optimizer)
+    after, _, _ = jit(update)(before, SMALL, Hyper({RL: 1.0, "peek": 1.0}, RATES))
+    expected = 0.5 * after.params["heads"]["peek"]["w"] + 0.5 * before.slow["heads"]["peek"]["w"]
+    np.testing.assert_allclose(after.slow["heads"]["peek"]["w"], expected, rtol=1e-6)
+    assert identical(after.slow["heads"][RL], before.slow["heads"][RL])
+    assert identical(after.slow["encoder"], before.slow["encoder"])  # goes with RL's
+
+
+def test_numbers_may_change_without_another_trace():
+    init, update, hyper = make_peeks(RL, "peek")
+    update = jax.jit(chex.assert_max_traces(update, n=1))
+    state = init(jax.random.key(0))
+    scales = []
+    for i in range(3):
+        rates = dict.fromkeys(RATES, np.float32(10.0**-i))
+        before = float(state.params["encoder"]["scale"][0])
+        state, _, _ = update(state, SMALL, Hyper({RL: np.float32(i), "peek": np.float32(1)}, rates))
+        scales.append(abs(float(state.params["encoder"]["scale"][0]) - before))
+    assert scales[0] > scales[1] > scales[2] > 0  # and they have their effect
+
+
+def test_each_offset_is_encoded_once_however_many_losses_ask():
+    calls = []
+    encoder = PIXELS._replace(apply=lambda params, x: calls.append(params) or PIXELS.apply(params, x))
+    offset = jnp.zeros(4, jnp.int32)
+    latents = make_latents(encoder, {"scale": 1.0}, {"scale": 2.0}, SMALL)
+    for _ in range(3):
+        for k in (0, 1, offset):
+            latents.online(k)
+        latents.slow(offset)
+    assert len(calls) == 4
+    np.testing.assert_array_equal(latents.online(offset), latents.online(0))
+    np.testing.assert_allclose(latents.slow(offset), 2 * latents.online(0))
+
+
+def test_state_can_be_donated_and_its_key_and_encoder_stay_the_callers():
+    init, update, hyper = make_peeks(RL, "peek")
+    key, encoder = jax.random.key(0), {"scale": jnp.ones(1)}
+    update = jax.jit(update, donate_argnums=0)
+    state = init(key, encoder)
+    kept = state
+    for _ in range(3):
+        state, _, _ = update(state, SMALL, hyper)
+    assert kept.params["encoder"]["scale"].is_deleted()  # it was donated
+    assert float(encoder["scale"][0]) == 1.0
+    jax.random.normal(key)
+    assert int(state.step) == 3
+
+
+def test_an_encoder_that_is_given_is_where_it_starts():
+    init, _, _ = make_peeks(RL, mode="frozen")
+    state = init(jax.random.key(0), {"scale": np.full(1, 7.0, np.float32)})
+    assert state.params["encoder"]["scale"] == state.slow["encoder"]["scale"] == 7
+    # The heads start as without it.
+    assert identical(state.params["heads"], init(jax.random.key(0)).params["heads"])
+
+
+def test_seeds_may_be_vmapped_from_the_start():
+    init, update, hyper = make_peeks(RL, "peek")
+    keys = jax.random.split(jax.random.key(0), 2)
+    both = jax.vmap(init)(keys)
+    both, _, metrics = jit(jax.vmap(update, (0, None, None)))(both, SMALL, hyper)
+    update = jit(update)
+    for i in range(2):
+        single, _, single_metrics = update(init(keys[i]), SMALL, hyper)
+        ours = to_numpy(jax.tree.map(lambda x, i=i: x[i], both.params))
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5), ours, single.params)
+        np.testing.assert_array_equal(metrics["peek/noise"][i], single_metrics["peek/noise"])
+    assert all_moved(*(jax.tree.map(lambda x, i=i: x[i], both.params) for i in range(2)))
+    assert not np.array_equal(*metrics["peek/noise"])
+
+
+def test_weights_must_be_those_of_the_losses():
+    init, update, hyper = make_peeks(RL, "peek")
+    for weights in ({RL: 1.0}, {RL: 1.0, "peek": 1.0, "other": 1.0}):
+        with pytest.raises(ValueError, match="weights .* for losses"):
+            update(init(jax.random.key(0)), SMALL, hyper._replace(weights=weights))
+
+
+@pytest.mark.parametrize("option", [{"augment": "both"}, {"target_encoder": "fast"}])
+def test_unknown_options_are_refused(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        make_update(PIXELS, {}, MODES["joint"], None, **option)
+
+
+def test_a_gate_that_is_shut_costs_no_differentiation():
+    # In frozen, the encoder's gradient is not merely zero: it is not asked for.
+    init, update, hyper = make_peeks(RL, mode="frozen")
+    state = init(jax.random.key(0))
+    after, _, metrics = jit(update)(state, SMALL, hyper)
+    assert identical(after.params["encoder"], state.params["encoder"])
+    gradient = 2 * np.asarray(state.params["heads"][RL]["w"])  # of the head's sum of squares
+    np.testing.assert_allclose(metrics["grad_norm"], np.linalg.norm(gradient), rtol=1e-5)
+
+
+# Acting
+
+FRAMES = np.random.default_rng(0).integers(0, 256, (500, 4, 6, 6), dtype=np.uint8)
+
+
+def q_values(head, latents, key=None):
+    """Values of 4 actions from the latent; noise of size 100 with a key."""
+    q = latents[:, :4] + head
+    return q if key is None else q + 100 * jax.random.normal(key, q.shape)
+
+
+def run_act(noisy, step, epsilon, key=0):
+    act = _acts[noisy]
+    head = np.zeros(4, np.float32)
+    return np.asarray(act({"scale": 1.0}, head, FRAMES, jax.random.key(key), step, np.float32(epsilon)))
+
+
+_acts = {noisy: jit(make_act(PIXELS, q_values, noisy=noisy)) for noisy in (False, True)}
+# The latent's first four numbers are the four frames' first pixels, newest last.
+GREEDY = FRAMES[:, :, 0, 0].argmax(1)
+
+
+def test_without_epsilon_and_noise_the_best_action_is_taken():
+    actions = run_act(False, 3, 0.0)
+    assert actions.dtype == np.int32
+    np.testing.assert_array_equal(actions, GREEDY)
+
+
+def test_epsilon_is_the_share_of_uniform_actions():
+    # With epsilon 0.4, a share of 0.4 * 3 / 4 = 0.3 is not greedy; 500 draws, standard deviation 0.02.
+    for epsilon, expected in ((0.4, 0.3), (1.0, 0.75)):
+        actions = run_act(False, 3, epsilon)
+        assert abs(np.mean(actions != GREEDY) - expected) < 0.08
+    counts = np.bincount(run_act(False, 3, 1.0), minlength=4)
+    assert counts.min() > 90  # 125 expected, standard deviation 10
+
+
+def test_draws_depend_on_key_and_step_alone():
+    base = run_act(False, 3, 1.0)
+    np.testing.assert_array_equal(base, run_act(False, 3, 1.0))
+    assert not np.array_equal(base, run_act(False, 4, 1.0))
+    assert not np.array_equal(base, run_act(False, 3, 1.0, key=1))
+
+
+def test_noise_is_for_training():
+    noisy = run_act(True, 3, 0.0)
+    assert np.mean(noisy != GREEDY) > 0.5
+    assert not np.array_equal(noisy, run_act(True, 4, 0.0))
