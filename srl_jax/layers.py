@@ -140,7 +140,7 @@ class NoisyDense(nn.Module):
         bias_sigma = self.param("bias_sigma", sigma, (self.features,))
         if noise is None:
             return x @ kernel + bias
-        noise = jnp.sign(noise) * jnp.sqrt(jnp.abs(noise))
+        noise = jax.lax.optimization_barrier(jnp.sign(noise) * jnp.sqrt(jnp.abs(noise)))
         noise_in, noise_out = noise[:inputs], noise[inputs:]
         kernel = kernel + kernel_sigma * (noise_in[:, None] * noise_out[None, :])
         return x @ kernel + (bias + bias_sigma * noise_out)

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 from srl_jax.layers import Conv, ConvTranspose, Dense
 from srl_jax.types import Array, Decoder, Encoder
 
-
 LEAST_SEEN = 0.95
 """The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
 
