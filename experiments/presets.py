@@ -47,6 +47,7 @@ _CATCH = {
     "eps_anneal_steps": 20_000,
     "eps_final": 0.02,
     "beta_anneal_steps": 80_000,
+    "eval_games": 200,
 }
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -187,13 +187,16 @@ def train(values: flags.FlagValues) -> None:
     check_paths(config)
     config = resolved(config)
 
+    from experiments import plots
     from experiments.draw import draw_run
     from srl_jax import checkpoint, loop
 
     checkpoint.check_sources(config)
     with run_directory(path, config):
         result = loop.train(config, path)
-    if not draw_run(path, config, pictures=result.pictures):
+    if plots.available():
+        draw_run(path, config, pictures=result.pictures)
+    else:
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
     print(f"{result.env_steps} env steps, {result.updates} updates; everything is in {path}")
 

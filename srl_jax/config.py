@@ -120,7 +120,9 @@ class Config:
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
     life_loss: bool = _value(bool, True, "a lost life ends the return (not the game) in training")
     sticky_actions: float = _share(0.0, "that the emulator repeats the last action")
-    noop_max: int = _value(int, 30, "most random no-ops at the start of a game", "env steps", minimum=0)
+    noop_max: int = _value(
+        int, 30, "random no-ops at the start of a game are fewer than this", "emulator frames", minimum=0
+    )
     frame_size: int = _value(
         int, 84, "height and width of a frame; Catch knows 42 and 84", "pixels", minimum=1
     )

@@ -32,7 +32,8 @@ def he_normal(fan_in: int):
 
     It keeps the size of a signal through convolutions and ReLU (He et al. 2015, equation 10). PyTorch's
     default shrinks it 2.4 times a layer, which goes unnoticed with pixels in 0..255, as the thesis' code has
-    them; with pixels in [0, 1] it left the latents of different Pong frames 4 % apart, against 17 %.
+    them. With pixels in [0, 1] the latents of different Pong frames, under `nature`, have a standard
+    deviation of 0.0005 with it and of 0.008 with this.
     """
     std = math.sqrt(2.0 / fan_in)
 

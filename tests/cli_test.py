@@ -30,6 +30,8 @@ class Loop(types.ModuleType):
 
     def train(self, config, out):
         self.calls.append((config, out))
+        (pathlib.Path(out) / "metrics.jsonl").touch()
+        return types.SimpleNamespace(env_steps=0, updates=0, pictures={})
 
 
 @pytest.fixture
@@ -207,7 +209,8 @@ def test_overwrite_replaces_a_run_but_not_what_it_starts_from(capsys, loop, tmp_
     monkeypatch.chdir(tmp_path)
     assert (out / "metrics.jsonl").exists()
     _train("--game=Catch", "--seed=1", f"--out={out}", "--overwrite")
-    assert [path.name for path in out.iterdir()] == ["config.json"]
+    assert {path.name for path in out.iterdir()} == {"config.json", "metrics.jsonl"}
+    assert (out / "metrics.jsonl").read_text() == ""  # the new run's
     assert Config.load(out).seed == 1
 
 
@@ -215,7 +218,7 @@ def test_a_run_starts_with_its_config_written(loop, tmp_path):
     out = tmp_path / "runs" / "a"
     _train(*JOINT, "--objective=latent_l2:weight=1e-6", f"--out={out}")
     ((config, path),) = loop.calls
-    assert path == str(out)
+    assert path == out
     assert Config.load(out) == config
     assert config.objectives == ("reconstruction:weight=1.0", "latent_l2:weight=1e-06")
     assert "n_step=3" in config.rl

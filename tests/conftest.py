@@ -1,9 +1,18 @@
 """What all tests share; pytest reads it before any test module, and so before jax is imported."""
 
+import atexit
 import os
+import shutil
+import tempfile
 
 # The tests are written for a CPU; JAX_PLATFORMS=cuda runs them on a GPU all the same.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
+
+# Tests that build the same function compile it once in a session, those in subprocesses too.
+_cache = tempfile.mkdtemp(prefix="srl_jax_tests_")
+os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
+os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
+atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 
 from hypothesis import HealthCheck, settings  # noqa: E402
 

@@ -79,7 +79,7 @@ def test_conv_transpose_refuses_sizes_that_its_mirror_could_not_have_seen(size):
         jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, 3, 3, 1)))
 
 
-def test_initialisation_is_uniform_within_one_over_the_root_of_fan_in(monkeypatch):
+def test_initialisation_is_uniform_within_one_over_the_root_of_fan_in():
     x = np.asarray(layers.uniform_fan_in(25)(jax.random.key(0), (100, 100)))
     assert np.abs(x).max() <= 0.2
     assert np.abs(x).max() > 0.199
@@ -87,13 +87,25 @@ def test_initialisation_is_uniform_within_one_over_the_root_of_fan_in(monkeypatc
     assert abs(x.mean()) < 0.01
     np.testing.assert_allclose(x.std(), 0.2 / np.sqrt(3), rtol=0.02)
 
+
+def test_he_normal_keeps_the_size_of_a_signal():
+    # Variance 2 / 50 = 0.2 ** 2; truncated at two deviations of the normal that is cut: 2 * 0.2 / 0.8796.
+    x = np.asarray(layers.he_normal(50)(jax.random.key(0), (100, 100)))
+    np.testing.assert_allclose(x.std(), 0.2, rtol=0.02)
+    assert abs(x.mean()) < 0.01 and 0.45 < np.abs(x).max() <= 0.4548
+
+
+def test_every_layer_knows_its_fan_in(monkeypatch):
     fans = []
-    monkeypatch.setattr(layers, "uniform_fan_in", lambda n: fans.append(n) or jax.nn.initializers.zeros)
+    record = lambda n: fans.append(n) or jax.nn.initializers.zeros  # noqa: E731
+    monkeypatch.setattr(layers, "uniform_fan_in", record)
+    monkeypatch.setattr(layers, "he_normal", record)
     cases = [
         (Dense(7), (1, 25), 25),
         (NoisyDense(7), (1, 25), 25),
         (Conv(6, 3, 1), (1, 5, 5, 4), 3 * 3 * 4),
-        (ConvTranspose(6, 3, 1, 7), (1, 5, 5, 4), 3 * 3 * 6),  # PyTorch counts the output side here
+        (ConvTranspose(6, 3, 1, 7), (1, 5, 5, 4), 3 * 3 * 4),
+        (ConvTranspose(6, 8, 4, 24), (1, 5, 5, 4), 2 * 2 * 4),  # an output pixel sees 8 / 4 = 2 a side
     ]
     for layer, shape, fan_in in cases:
         arguments = [None] if isinstance(layer, NoisyDense) else []

@@ -1,9 +1,11 @@
 """It learns: every mode, on a small Catch, through the same loop as any run.
 
-A random player catches 18 % (mean return -0.64). Each mode has to catch clearly more than half after a
-short run; the full statement, 95 % over 200 games, is a campaign in experiments/results.
+A random player catches 18 % of the balls: a mean return of -0.64. Over 200 games the standard error of a
+return near that is 0.054, so nothing that acts at random passes -0.45. The full statement, 95 % within
+three minutes, is a campaign and lies in experiments/results.
 """
 
+import numpy as np
 import pytest
 
 from experiments.presets import preset_values
@@ -11,21 +13,48 @@ from srl_jax import loop
 from srl_jax.config import Config
 from srl_jax.metrics import read_metrics
 
-SHORT = {"steps": 24_000, "eval_every": 24_000, "eval_games": 100, "eps_anneal_steps": 8_000}
+SHORT = {"steps": 24_000, "eval_every": 24_000, "eval_games": 200, "eps_anneal_steps": 8_000}
 
 
 def run(path, preset, **overrides):
+    """The rows of a short run, and the mean return at its end (None where it has no policy)."""
     path.mkdir()
     config = Config(**{**preset_values(preset), **SHORT, **overrides})
     config.save(path)
     loop.train(config, path, progress=False)
-    return read_metrics(path / "metrics.jsonl")
+    rows = read_metrics(path / "metrics.jsonl")
+    return rows, rows[-1].get("eval/return_mean")
 
 
-def final_return(rows):
-    return [row["eval/return_mean"] for row in rows if row["kind"] == "eval"][-1]
+@pytest.fixture(scope="module")
+def rl_only(tmp_path_factory):
+    path = tmp_path_factory.mktemp("learning") / "rl_only"
+    return path, run(path, "catch/rl_only")
 
 
-@pytest.mark.parametrize("mode", ["rl_only", "joint"])
-def test_from_scratch(tmp_path, mode):
-    assert final_return(run(tmp_path / mode, f"catch/{mode}")) > 0.0
+def test_rl_only(rl_only):
+    _, (rows, final) = rl_only
+    assert rows[0]["eval/return_mean"] < -0.4 < -0.2 < final
+
+
+def test_joint(tmp_path):
+    rows, final = run(tmp_path / "joint", "catch/joint")
+    assert final > -0.2
+    losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
+    assert losses[-1] < 0.6 * losses[0]
+
+
+@pytest.mark.parametrize("mode", ["frozen", "finetuned", "decoupled"])
+def test_on_the_encoder_of_an_rl_run(rl_only, tmp_path, mode):
+    # Half the steps: the new head finds an encoder that knows where the ball is. (From scratch, decoupled
+    # has to wait until reconstruction sees the ball, which takes far longer than this test.)
+    source, _ = rl_only
+    short = {"steps": 12_000, "eval_every": 12_000, "eps_anneal_steps": 4_000}
+    _, final = run(tmp_path / mode, f"catch/{mode}", encoder_from=str(source), **short)
+    assert final > -0.45
+
+
+def test_pretrain(tmp_path):
+    rows, _ = run(tmp_path / "pretrain", "catch/pretrain", steps=8_000)
+    losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
+    assert np.all(np.diff(losses)[:3] < 0) and losses[-1] < 0.6 * losses[0]

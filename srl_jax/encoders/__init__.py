@@ -3,7 +3,7 @@
 `observation_shape` is (H, W, S). Each comes with the decoder that mirrors it.
 """
 
-from srl_jax.encoders.convolutional import Layer, convolutional
+from srl_jax.encoders.convolutional import Layer, convolutional_encoder
 from srl_jax.types import Encoder
 
 __all__ = ["REGISTRY", "nature", "sac_ae", "tiny"]
@@ -15,7 +15,7 @@ def nature(observation_shape: tuple) -> Encoder:
     Its decoder ends in a sigmoid, as in the thesis' code.
     """
     layers = [Layer(32, 8, 4), Layer(64, 4, 2), Layer(64, 3, 1)]
-    return convolutional(observation_shape, layers, sigmoid=True)
+    return convolutional_encoder(observation_shape, layers, sigmoid=True)
 
 
 def sac_ae(observation_shape: tuple, *, features: int = 256, layer_norm: bool = True) -> Encoder:
@@ -31,7 +31,7 @@ def sac_ae(observation_shape: tuple, *, features: int = 256, layer_norm: bool = 
     if features < 1:
         raise ValueError("features must be at least 1")
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
-    return convolutional(observation_shape, layers, features=features, layer_norm=layer_norm)
+    return convolutional_encoder(observation_shape, layers, features=features, layer_norm=layer_norm)
 
 
 def tiny(observation_shape: tuple, *, features: int = 64) -> Encoder:
@@ -43,7 +43,7 @@ def tiny(observation_shape: tuple, *, features: int = 64) -> Encoder:
     if features < 1:
         raise ValueError("features must be at least 1")
     layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
-    return convolutional(observation_shape, layers, features=features)
+    return convolutional_encoder(observation_shape, layers, features=features)
 
 
 REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny}

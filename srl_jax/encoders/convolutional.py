@@ -89,7 +89,7 @@ class DecoderNetwork(nn.Module):
         return nn.sigmoid(x) if self.sigmoid else x
 
 
-def convolutional(
+def convolutional_encoder(
     observation_shape: tuple,
     layers: Sequence[Layer],
     *,
