@@ -48,18 +48,11 @@ def main(argv: list[str]) -> None:
 
     import jax
 
-    from srl_jax import envs, loop
+    from srl_jax import loop
     from srl_jax.evaluate import evaluate
 
     agent, params, manifest = loop.load_agent(FLAGS.run)
-    env = envs.make(
-        config.game,
-        num_envs=min(FLAGS.games, config.num_envs),
-        seed=FLAGS.seed,
-        frame_size=config.frame_size,
-        sticky_actions=config.sticky_actions,
-        noop_max=config.noop_max,
-    )
+    env = loop.make_env(config, min(FLAGS.games, config.num_envs), FLAGS.seed)
     played = evaluate(
         loop.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
         env,

@@ -30,8 +30,8 @@ _PRETRAIN = {
     "pretrain_epsilon": 0.3,
 }
 
-# Small enough to learn Catch within three minutes on two cores. Exploration and the importance weights
-# are annealed within the run; returns are -1 or 1.
+# Small enough for Catch in minutes on two cores (not yet timed on an idle machine). Exploration and the
+# importance weights are annealed within the run; returns are -1 or 1.
 _CATCH = {
     "game": "Catch",
     "rl": "rainbow:v_min=-2,v_max=2,hidden=128,n_step=5",

@@ -70,6 +70,18 @@ def greedy_policy(agent: Agent, params: Any, key: jax.Array, *, noisy: bool = Fa
     return policy
 
 
+def make_env(config: Config, num_envs: int, seed: int):
+    """The environments of a run's game and protocol, see `srl_jax.envs.make`."""
+    return envs.make(
+        config.game,
+        num_envs=num_envs,
+        seed=seed,
+        frame_size=config.frame_size,
+        sticky_actions=config.sticky_actions,
+        noop_max=config.noop_max,
+    )
+
+
 def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
     """An agent, its parameters and the manifest of a checkpoint or of a run's newest one.
 
@@ -327,15 +339,7 @@ class _Run:
 
     def make_env(self, purpose: str, num_envs: int):
         """Environments with seeds of their own for this purpose."""
-        config = self.config
-        return envs.make(
-            config.game,
-            num_envs=num_envs,
-            seed=seed_for(config.seed, purpose, "environments"),
-            frame_size=config.frame_size,
-            sticky_actions=config.sticky_actions,
-            noop_max=config.noop_max,
-        )
+        return make_env(self.config, num_envs, seed_for(self.config.seed, purpose, "environments"))
 
     def initial_encoder(self) -> Any:
         """Parameters that the encoder starts from, or None for scratch."""

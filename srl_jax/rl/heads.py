@@ -53,6 +53,6 @@ class QNetwork(nn.Module):
         """Each layer's noise, cut from one draw: every draw more costs compilation time."""
         lengths = [n for inputs, hidden, out in sizes for n in (inputs + hidden, hidden + out)]
         ends = np.cumsum(lengths)
-        # Without the barrier XLA draws anew for each of the weights that a number is multiplied with.
+        # Meant to keep XLA from fusing the draw into the loop over weights; its gain is not measured.
         noise = jax.lax.optimization_barrier(jax.random.normal(key, (int(ends[-1]),)))
         return jnp.split(noise, ends[:-1].tolist())
