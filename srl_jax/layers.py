@@ -32,8 +32,7 @@ def he_normal(fan_in: int):
 
     It keeps the size of a signal through convolutions and ReLU (He et al. 2015, equation 10). PyTorch's
     default shrinks it 2.4 times a layer, which goes unnoticed with pixels in 0..255, as the thesis' code has
-    them. With pixels in [0, 1] the latents of different Pong frames, under `nature`, have a standard
-    deviation of 0.0005 with it and of 0.008 with this.
+    them.
     """
     std = math.sqrt(2.0 / fan_in)
 
@@ -42,6 +41,22 @@ def he_normal(fan_in: int):
         return std / 0.8796 * jax.random.truncated_normal(key, -2.0, 2.0, shape, dtype)
 
     return init
+
+
+def zero_sum(init):
+    """Another initialiser's kernels [k, k, C, features], less the mean of each k x k window.
+
+    A uniform image then gives 0, as with edge detectors. Most of a frame is background; with kernels that
+    answer to it, the background alone settles which units are on, and a network whose units do not switch is
+    linear. Over 240 frames of Pong, 6 to 9 % of the latents of `nature` are on in some frames and off in
+    others without this, 64 to 67 % with it (two seeds).
+    """
+
+    def centred(key, shape, dtype=jnp.float32):
+        kernel = init(key, shape, dtype)
+        return kernel - jnp.mean(kernel, (0, 1), keepdims=True)
+
+    return centred
 
 
 class Dense(nn.Module):
@@ -58,15 +73,24 @@ class Dense(nn.Module):
 
 
 class Conv(nn.Module):
-    """A VALID convolution, float32 [B, H, W, C] -> [B, H', W', features]; `he_normal`, biases 0."""
+    """A VALID convolution, float32 [B, H, W, C] -> [B, H', W', features]; `he_normal`, biases 0.
+
+    Attributes:
+        features: output channels.
+        kernel, stride: in pixels.
+        on_image: whether the input is an image; its kernels then start `zero_sum`.
+    """
 
     features: int
     kernel: int
     stride: int
+    on_image: bool = False
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
         init = he_normal(self.kernel**2 * x.shape[-1])
+        if self.on_image:
+            init = zero_sum(init)
         kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         return _valid_conv(x, kernel, self.stride) + bias

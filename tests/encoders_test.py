@@ -82,6 +82,22 @@ def test_pixels_are_divided_by_255():
     np.testing.assert_allclose(from_bytes, from_unit, rtol=1e-6, atol=1e-6)
 
 
+def test_latents_start_blind_to_a_uniform_background_and_see_a_ball():
+    # Two grey fields, and on Pong's grey a ball of 2 x 4 pixels in 30 places. A uniform image gives 0 (biases
+    # start at 0); a ball moves latents by tenths, and switches units on that are off elsewhere.
+    rng = np.random.default_rng(0)
+    frames = np.full((32, 84, 84, STACK), 87, np.uint8)
+    frames[1] = 200
+    for frame, (y, x) in zip(frames[2:], rng.integers(0, 80, (30, 2)), strict=True):
+        frame[y : y + 4, x : x + 2] = 236
+    encoder = encoders.nature((84, 84, STACK))
+    z = np.asarray(jit(lambda key, x: encoder.apply(encoder.init(key), x))(jax.random.key(0), frames))
+    np.testing.assert_allclose(z[:2], 0, atol=1e-4)
+    assert 0.05 < z[2:].std(0).mean() < 2
+    on = (z[2:] > 0).mean(0)
+    assert np.mean((on > 0) & (on < 1)) > 0.5
+
+
 @pytest.mark.parametrize("layer_norm", [True, False])
 def test_bottleneck_is_normalised_before_its_tanh(layer_norm):
     encoder = encoders.sac_ae((17, 17, STACK), features=64, layer_norm=layer_norm)

@@ -8,6 +8,7 @@ import pytest
 import rlax
 
 from srl_jax import rl
+from srl_jax.rl import heads
 from srl_jax.types import Context, Encoder, Latents, Window
 from tests.helpers import all_zero, count, jit, random_params
 
@@ -15,7 +16,8 @@ pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:P
 
 BATCH, FEATURES, ACTIONS, ATOMS = 6, 5, 3, 7
 CONTEXT = Context(Encoder(None, None, FEATURES, (1, 1, 4), None), ACTIONS)
-SMALL = {"hidden": 8, "atoms": ATOMS, "v_min": -2.0, "v_max": 4.0}
+ATOMS_51 = np.linspace(-10, 10, 51, dtype=np.float32)
+SMALL = {"init_std": 0.0, "hidden": 8, "atoms": ATOMS, "v_min": -2.0, "v_max": 4.0}
 
 
 def make_latents(online, slow):
@@ -99,7 +101,7 @@ def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step
 
     atoms = np.linspace(-2, 4, ATOMS, dtype=np.float32)
     expected = lambda out: softmax(out) @ atoms if distributional else out[..., 0]  # noqa: E731
-    td_error = []
+    td_error, unweighted = [], []
     for b in range(BATCH):
         total, discount, offset = 0.0, 1.0, 0
         while offset < n_step and window.valid[b, offset]:
@@ -114,13 +116,17 @@ def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step
             loss = rlax.categorical_double_q_learning(
                 atoms, out_tm1, action, total, discount, atoms, slow_t, jnp.asarray(selector)
             )
+            best = softmax(slow_t[selector.argmax()])
+            target = np.asarray(rlax.categorical_l2_project(total + discount * atoms, best, atoms))
+            td_error.append(np.sum(target * np.log((target + 1e-30) / softmax(out_tm1)[action])))  # KL
+            unweighted.append(float(loss))
         else:
             loss = rlax.double_q_learning(
                 out_tm1[:, 0], action, total, discount, jnp.asarray(slow_t[:, 0]), jnp.asarray(selector)
             )
-        td_error.append(float(loss))
-    td_error = np.array(td_error)
-    unweighted = td_error if distributional else np.asarray(rlax.huber_loss(td_error))
+            td_error.append(float(loss))
+            unweighted.append(float(rlax.huber_loss(loss)))
+    unweighted = np.array(unweighted)
 
     np.testing.assert_allclose(q_values, expected(network(head, online[0], dueling)), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(metrics["td_error"], td_error, rtol=1e-4, atol=1e-5)
@@ -241,6 +247,30 @@ def test_head_of_the_thesis_has_its_size():
     assert count(shapes) == 2 * (2 * 1_606_144 + 156_978 + 26_163)
 
 
+def test_normal_logits():
+    assert rl.normal_logits(np.linspace(-2, 2, 5), 1.0) == (-2.0, -0.5, 0.0, -0.5, -2.0)
+    assert rl.normal_logits(np.linspace(-2, 2, 5), 2.0) == (-0.5, -0.125, 0.0, -0.125, -0.5)
+    assert rl.normal_logits(np.array([1.0, 2.0, 3.0]), 1.0) == (0.0, -0.5, -2.0)  # 0 is not among them
+
+
+@pytest.mark.parametrize("dueling", [True, False])
+@pytest.mark.parametrize(("init_std", "expected"), [(0.0, 20 / 12**0.5), (1.0, 1.0), (2.0, 2.0)])
+def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expected):
+    # On 51 atoms in [-10, 10]; the uniform distribution has a deviation of 20 / sqrt(12).
+    algorithm = rl.rainbow(CONTEXT, init_std=init_std, dueling=dueling)
+    network = heads.QNetwork(
+        ACTIONS, 51, 512, dueling, True, 0.1, rl.normal_logits(ATOMS_51, init_std) if init_std else None
+    )
+    head = jit(algorithm.objective.init)(jax.random.key(0))
+    z = np.random.default_rng(0).normal(size=(BATCH, FEATURES)).astype(np.float32)
+    probs = jit(lambda head, z: jax.nn.softmax(network.apply({"params": head}, z, None)))(head, z)
+    mean = probs @ ATOMS_51
+    std = np.sqrt(probs @ ATOMS_51**2 - mean**2)
+    np.testing.assert_allclose(std, expected, rtol=0.15)
+    np.testing.assert_allclose(jit(algorithm.q_values)(head, z), mean, rtol=1e-4, atol=1e-4)
+    assert np.abs(mean).max() < 0.6
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -248,10 +278,11 @@ def test_head_of_the_thesis_has_its_size():
         ({"hidden": 0}, "hidden"),
         ({"atoms": 1}, "atoms"),
         ({"v_min": 1.0, "v_max": 1.0}, "v_min must be below v_max"),
+        ({"init_std": -1.0}, "init_std must be at least 0"),
     ],
 )
 def test_options_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         rl.rainbow(CONTEXT, **options)
-    if "n_step" not in options and "hidden" not in options:  # the support matters only where there is one
+    if "atoms" in options or "v_min" in options:  # the support matters only where there is one
         rl.rainbow(CONTEXT, distributional=False, **options)

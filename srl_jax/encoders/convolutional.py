@@ -12,6 +12,10 @@ from srl_jax.types import Array, Decoder, Encoder
 LEAST_SEEN = 0.95
 """The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
 
+INPUT_GAIN = 32.0
+"""Pixels in [0, 1] are multiplied by it, so that latents are of the order of 1 and differ from frame to
+frame by tenths: between frames only a ball and two paddles may change, a hundredth of the pixels."""
+
 
 class Layer(NamedTuple):
     """One convolution: output channels, side of the kernel and stride, both in pixels."""
@@ -36,9 +40,9 @@ class EncoderNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        x = to_unit(observation)
-        for layer in self.layers:
-            x = nn.relu(Conv(*layer)(x))
+        x = to_unit(observation) * INPUT_GAIN
+        for i, layer in enumerate(self.layers):
+            x = nn.relu(Conv(*layer, on_image=i == 0)(x))
         x = x.reshape(x.shape[0], -1)
         if not self.features:
             return x

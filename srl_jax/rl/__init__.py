@@ -9,18 +9,20 @@ import jax.numpy as jnp
 import numpy as np
 
 from srl_jax.rl.heads import QNetwork
-from srl_jax.rl.losses import categorical_q_learning, huber, q_learning
+from srl_jax.rl.losses import categorical_q_learning, categorical_target, entropy, huber, q_learning
 from srl_jax.rl.losses import n_step as n_step_view
 from srl_jax.types import Context, Latents, Objective, Window
 
-__all__ = ["REGISTRY", "Algorithm", "rainbow"]
+__all__ = ["REGISTRY", "Algorithm", "normal_logits", "rainbow"]
 
 
 class Algorithm(NamedTuple):
     """An RL algorithm: its term of the loss, how it values actions, and what it asks of replay.
 
     Attributes:
-        objective: the loss; its metrics are `td_error` float32 [B] (what priorities are made of) and
+        objective: the loss; its metrics are `td_error` float32 [B] (what priorities are made of: the
+            temporal-difference error, or the Kullback-Leibler divergence of the value distribution from its
+            target, as in Hessel et al. 2018, section 3) and
             `q_max_mean`, a scalar: the mean over the batch of the largest value of s_t.
         q_values: (head, latents [B, D], key | None) -> float32 [B, A]; without a key, without noise.
         alpha: the priority exponent; 0 where replay is uniform.
@@ -43,6 +45,7 @@ def rainbow(
     atoms: int = 51,
     v_min: float = -10.0,
     v_max: float = 10.0,
+    init_std: float = 1.0,
     noisy_std: float = 0.1,
     alpha: float = 0.5,
     hidden: int = 512,
@@ -58,12 +61,15 @@ def rainbow(
         prioritized: replay by priority, `|td_error| ** alpha`; otherwise uniform.
         n_step: steps of reward before bootstrapping.
         atoms, v_min, v_max: the value distribution's support, in units of (discounted) reward.
+        init_std: the value distribution starts near a normal around 0 of this standard deviation, in units of
+            reward; 0: near uniform, as in C51. See `normal_logits`.
         noisy_std: see `srl_jax.layers.NoisyDense`.
         alpha: the priority exponent (Schaul et al. 2016).
         hidden: width of each stream's hidden layer.
 
     Raises:
-        ValueError: where n_step or hidden is 0, atoms is below 2, or v_min is not below v_max.
+        ValueError: where n_step or hidden is 0, atoms is below 2, v_min is not below v_max, or init_std is
+            below 0.
     """
     if n_step < 1:
         raise ValueError("n_step must be at least 1")
@@ -73,8 +79,13 @@ def rainbow(
         raise ValueError("atoms must be at least 2")
     if distributional and v_min >= v_max:
         raise ValueError(f"v_min must be below v_max, not {v_min} and {v_max}")
-    network = QNetwork(context.num_actions, atoms if distributional else 1, hidden, dueling, noisy, noisy_std)
+    if init_std < 0:
+        raise ValueError("init_std must be at least 0")
     support = np.linspace(v_min, v_max, atoms, dtype=np.float32) if distributional else None
+    prior = normal_logits(support, init_std) if distributional and init_std else None
+    network = QNetwork(
+        context.num_actions, atoms if distributional else 1, hidden, dueling, noisy, noisy_std, prior
+    )
 
     def init(key):
         return network.init(key, jnp.zeros((1, context.encoder.features)), None)["params"]
@@ -104,7 +115,11 @@ def rainbow(
             losses = jax.vmap(categorical_q_learning, (0, None, 0, 0, 0, 0, 0))(
                 out_tm1, support, a_tm1, r_t, discount_t, slow_t, selector_t
             )
-            td_error = losses
+            # The KL divergence; the target's entropy says how random a return is, not how surprising.
+            target = jax.vmap(categorical_target, (None, 0, 0, 0, 0))(
+                support, r_t, discount_t, slow_t, selector_t
+            )
+            td_error = jnp.maximum(losses - jax.vmap(entropy)(target), 0.0)
         else:
             td_error = jax.vmap(q_learning)(
                 out_tm1[..., 0], a_tm1, r_t, discount_t, slow_t[..., 0], selector_t
@@ -119,6 +134,25 @@ def rainbow(
         q_values=q_values,
         alpha=alpha if prioritized else 0.0,
     )
+
+
+def normal_logits(atoms: np.ndarray, std: float) -> tuple[float, ...]:
+    """The logits of a normal distribution over atoms, around 0 (or the atom nearest to it).
+
+    A categorical value distribution starts uniform on [v_min, v_max] in C51 (Bellemare et al. 2017). Where
+    nothing but bootstrapping narrows it, as in games without short episodes, each copy to the slow network
+    narrows it by discount ** n alone: with the thesis' settings (0.97 every 500 updates) its standard deviation
+    is still 3.2 after 10,000 updates, while the values of actions differ by hundredths.
+
+    Args:
+        atoms: float32 [M], ascending returns.
+        std: standard deviation, in units of reward; above 0.
+
+    Returns:
+        M logits, the largest 0.
+    """
+    centre = np.clip(0.0, atoms[0], atoms[-1])
+    return tuple((-0.5 * ((atoms.astype(np.float64) - centre) / std) ** 2).tolist())
 
 
 _plain = partial(rainbow, double=False, dueling=False, noisy=False, prioritized=False, n_step=1)

@@ -17,6 +17,7 @@ class QNetwork(nn.Module):
         atoms: M, of the value distribution; 1 for plain values.
         hidden: width of each stream.
         dueling, noisy: the parts of Rainbow; noise_std only matters where noisy.
+        prior: M constants added to the logits of every action: what the distribution starts near; none: 0.
     """
 
     num_actions: int
@@ -25,6 +26,7 @@ class QNetwork(nn.Module):
     dueling: bool
     noisy: bool
     noisy_std: float
+    prior: tuple[float, ...] | None = None
 
     @nn.compact
     def __call__(self, z: Array, key: Array | None) -> Array:
@@ -44,10 +46,11 @@ class QNetwork(nn.Module):
             x = nn.relu(layer(f"{name}_hidden", self.hidden, z))
             return layer(f"{name}_out", outputs[name], x).reshape(z.shape[0], -1, self.atoms)
 
+        prior = 0.0 if self.prior is None else jnp.asarray(self.prior, jnp.float32)
         q = stream("q")
-        if self.dueling:
-            q = q - jnp.mean(q, 1, keepdims=True) + stream("v")
-        return q
+        if not self.dueling:
+            return q + prior
+        return q - jnp.mean(q, 1, keepdims=True) + (stream("v") + prior)
 
     def _noise(self, key: Array, sizes: list[tuple]) -> list[Array]:
         """Each layer's noise, cut from one draw: every draw more costs compilation time."""

@@ -76,10 +76,22 @@ def categorical_q_learning(
         [2, 1, 0, 0, 0, 2, 1],
     )
     chex.assert_type([q_logits_tm1, a_tm1], [float, int])
+    target = categorical_target(atoms, r_t, discount_t, q_logits_slow_t, q_selector_t)
+    return -jnp.sum(target * jax.nn.log_softmax(q_logits_tm1[a_tm1]))
+
+
+def categorical_target(
+    atoms: Array, r_t: Array, discount_t: Array, q_logits_slow_t: Array, q_selector_t: Array
+) -> Array:
+    """What `categorical_q_learning` compares with; arguments as there. float32 [M], no gradient."""
     probs_t = jax.nn.softmax(q_logits_slow_t[jnp.argmax(q_selector_t)])
     target = categorical_projection(r_t + discount_t * atoms, probs_t, atoms)
-    target = jax.lax.stop_gradient(target)
-    return -jnp.sum(target * jax.nn.log_softmax(q_logits_tm1[a_tm1]))
+    return jax.lax.stop_gradient(target)
+
+
+def entropy(probs: Array) -> Array:
+    """The entropy of a distribution, float32 [M] -> [], in nats; `0 log 0` is 0."""
+    return -jnp.sum(probs * jnp.log(jnp.maximum(probs, 1e-30)))
 
 
 def categorical_projection(support: Array, probs: Array, atoms: Array) -> Array:
