@@ -141,8 +141,8 @@ def normal_logits(atoms: np.ndarray, std: float) -> tuple[float, ...]:
 
     A categorical value distribution starts uniform on [v_min, v_max] in C51 (Bellemare et al. 2017). Where
     nothing but bootstrapping narrows it, as in games without short episodes, each copy to the slow network
-    narrows it by discount ** n alone: with the thesis' settings (0.97 every 500 updates) its standard deviation
-    is still 3.2 after 10,000 updates, while the values of actions differ by hundredths.
+    narrows it by discount ** n alone: with the thesis' settings (0.97 every 500 updates) its standard
+    deviation is still 3.2 after 10,000 updates, while the values of actions differ by hundredths.
 
     Args:
         atoms: float32 [M], ascending returns.
