@@ -27,7 +27,7 @@ def uniform_fan_in(fan_in: int):
     return init
 
 
-def he_normal(fan_in: int):
+def he_normal(fan_in: float):
     """An initialiser: a normal of variance 2 / fan_in, truncated at two deviations; for kernels below a ReLU.
 
     It keeps the size of a signal through convolutions and ReLU (He et al. 2015, equation 10). PyTorch's
@@ -109,12 +109,14 @@ class ConvTranspose(nn.Module):
         stride: the factor by which the image grows.
         size: side of the output, in pixels; at least `(h - 1) * stride + kernel`, and less than `stride`
             above it (what PyTorch calls output padding): what the mirrored layer saw.
+        init_scale: factor of the kernel's initial values, `he_normal`'s.
     """
 
     features: int
     kernel: int
     stride: int
     size: int
+    init_scale: float = 1.0
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -122,7 +124,8 @@ class ConvTranspose(nn.Module):
         height = x.shape[1]
         if not 0 <= self.size - ((height - 1) * s + k) < s:
             raise ValueError(f"a kernel of {k} with stride {s} cannot make {self.size} pixels from {height}")
-        init = he_normal(max(1, k // s) ** 2 * channels)  # the inputs that reach an output pixel
+        fan_in = max(1, k // s) ** 2 * channels  # the inputs that reach an output pixel
+        init = he_normal(fan_in / self.init_scale**2)
         kernel = self.param("kernel", init, (k, k, channels, self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
         taps = -(-k // s)

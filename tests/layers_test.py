@@ -113,6 +113,25 @@ def test_every_layer_knows_its_fan_in(monkeypatch):
         assert fans.pop() == fan_in and not fans
 
 
+def test_init_scale_multiplies_the_kernel():
+    x = jnp.zeros((1, 3, 3, 2))
+    whole, tenth = (
+        jit(ConvTranspose(4, 4, 2, 8, init_scale=scale).init)(jax.random.key(0), x)["params"]
+        for scale in (1.0, 0.1)
+    )
+    np.testing.assert_allclose(tenth["kernel"], 0.1 * whole["kernel"], rtol=1e-5)
+    assert np.abs(whole["kernel"]).max() > 0.3
+
+
+def test_zero_sum_takes_each_windows_mean():
+    def init(key, shape, dtype):
+        return jnp.arange(8.0, dtype=dtype).reshape(shape)
+
+    # Values 0..7 in order [2, 2, 2, 1]: channel 0 has 0, 2, 4, 6 (mean 3), channel 1 has 1, 3, 5, 7 (mean 4).
+    kernel = layers.zero_sum(init)(None, (2, 2, 2, 1))
+    np.testing.assert_array_equal(kernel.reshape(4, 2), [[-3, -3], [-1, -1], [1, 1], [3, 3]])
+
+
 def test_noisy_dense_by_hand():
     # Two inputs, one output; e = (4, -9, 0.25), so f(e_in) = (2, -3) and f(e_out) = 0.5.
     # Weights 1 + 0.1 * 2 * 0.5 = 1.1 and 2 + 0.2 * -3 * 0.5 = 1.7; bias 3 + 0.4 * 0.5 = 3.2.

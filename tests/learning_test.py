@@ -5,7 +5,6 @@ return near that is 0.054, so nothing that acts at random passes -0.45. The full
 three minutes, is a campaign and lies in experiments/results.
 """
 
-import numpy as np
 import pytest
 
 from experiments.presets import preset_values
@@ -57,4 +56,5 @@ def test_on_the_encoder_of_an_rl_run(rl_only, tmp_path, mode):
 def test_pretrain(tmp_path):
     rows, _ = run(tmp_path / "pretrain", "catch/pretrain", steps=8_000)
     losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
-    assert np.all(np.diff(losses)[:3] < 0) and losses[-1] < 0.6 * losses[0]
+    # A black image has 0.0051. One that shows the paddle and no ball is near 0.0018: 3 of 16 pixels.
+    assert losses[-1] < 0.0018 and losses[-1] < losses[3] < losses[0]
