@@ -87,6 +87,9 @@ class Config:
         "Adam's learning rate of the encoder; 0: lr_rl where RL trains it, else lr_srl",
         minimum=0,
     )  # fmt: skip
+    lr_final: float = _share(
+        1.0, "what is left of all learning rates at the end of the run; they fall linearly", "share"
+    )
     decoder_weight_decay: float = _value(
         float, 1e-7, "L2 weight decay of the decoders, added before Adam's scaling", minimum=0
     )

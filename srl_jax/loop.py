@@ -23,7 +23,7 @@ from srl_jax.optim import RL
 from srl_jax.progress import Progress
 from srl_jax.replay import Replay
 from srl_jax.types import TrainState, Window
-from srl_jax.update import make_latents, named_key
+from srl_jax.update import Hyper, make_latents, named_key
 
 PICTURES = 6
 """Examples in the picture of what an objective learnt."""
@@ -103,6 +103,7 @@ class _Run:
         self.env = self.make_env("train", config.num_envs)
         self.num_actions = int(self.env.single_action_space.n)
         self.agent = make_agent(config, self.num_actions)
+        self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.key = jax.random.key(config.seed)
         self.state = self.agent.init(self.key, self.initial_encoder())
         self.replay = Replay(
@@ -220,6 +221,17 @@ class _Run:
 
     # Learning
 
+    @property
+    def hyper(self) -> Hyper:
+        """The numbers of the next update: the agent's, with learning rates on their way to `lr_final`."""
+        hyper = self.agent.hyper
+        if self.config.lr_final == 1.0:
+            return hyper
+        left = linear(1.0, self.config.lr_final, self.config.steps, self.env_steps)
+        return hyper._replace(
+            learning_rates={name: np.float32(rate * left) for name, rate in self.learning_rates.items()}
+        )
+
     def due(self) -> int:
         """Updates to do now, so that there are `updates_per_step` for each env step since learning began."""
         config = self.config
@@ -232,7 +244,7 @@ class _Run:
     def launch_update(self) -> None:
         """Hands the device a window; does not wait."""
         window, indices = self.replay.sample(self.config.batch_size, self.beta)
-        self.state, td_error, metrics = self.agent.update(self.state, window, self.agent.hyper)
+        self.state, td_error, metrics = self.agent.update(self.state, window, self.hyper)
         self.updates += 1
         self.log.append(metrics)
         self.pending.append((indices, td_error))

@@ -1,6 +1,7 @@
 """The loop: schedules, files and reproducibility of whole short runs on Catch."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from srl_jax import checkpoint, loop
 from srl_jax.config import Config
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.specs import ConfigError
+from srl_jax.update import Hyper
 
 SMALL = {
     "game": "Catch",
@@ -160,7 +162,7 @@ def test_early_stop(tmp_path):
 
 def test_updates_are_compiled_once(joint):
     del joint
-    run = loop._Run(Config(**SMALL), None, False)
+    run = loop._Run(Config(**SMALL, lr_final=0.5), None, False)
     from srl_jax.replay import Window  # the type that replay gives
 
     run.replay.begin(run.env.reset()[0])
@@ -174,6 +176,7 @@ def test_updates_are_compiled_once(joint):
     for _ in range(3):
         run.launch_update()
         run.finish_updates()
+        run.env_steps += 40  # another learning rate
     assert isinstance(run.replay.sample(2, 0.5)[0], Window)
     assert run.agent.update._cache_size() == 1
 
@@ -183,3 +186,22 @@ def test_config_is_data(joint):
     values = json.loads((path / "config.json").read_text())
     assert Config.load(path).seed == values["seed"] == 3
     assert values["versions"]["jax"]
+
+
+def test_learning_rates_fall_linearly_to_the_share_that_is_left():
+    rates = {"encoder": 0.0, "rl": 4e-3}
+    hyper = Hyper({"rl": np.float32(1)}, {name: np.float32(rate) for name, rate in rates.items()})
+
+    def at(env_steps, **values):
+        config = Config(**{**SMALL, "steps": 200, **values})
+        run = SimpleNamespace(
+            agent=SimpleNamespace(hyper=hyper), config=config, env_steps=env_steps, learning_rates=rates
+        )
+        return loop._Run.hyper.fget(run)
+
+    assert at(150) is hyper  # by default they stay as they are
+    assert at(0, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 4e-3})
+    assert at(150, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 1.6e-3})
+    assert at(200, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 0.8e-3})
+    assert at(150, lr_final=0.2).weights == hyper.weights
+    assert all(rate.dtype == np.float32 for rate in at(150, lr_final=0.2).learning_rates.values())
