@@ -45,10 +45,13 @@ def test_joint(tmp_path):
 
 @pytest.mark.parametrize("mode", ["frozen", "finetuned", "decoupled"])
 def test_on_the_encoder_of_an_rl_run(rl_only, tmp_path, mode):
-    # Half the steps: the new head finds an encoder that knows where the ball is. From scratch,
-    # decoupled does not pass: 24,000 steps ended at -0.65, chance; reconstruction had not found the ball.
+    # Half the steps: the new head finds an encoder that knows where the ball is. Decoupled has to keep the
+    # encoder near it, by a small rate: at the preset's, reconstruction, which does not show the ball on Catch,
+    # makes the encoder forget it (-0.60), and from scratch it does not find it.
     source, _ = rl_only
     short = {"steps": 12_000, "eval_every": 12_000, "eps_anneal_steps": 4_000}
+    if mode == "decoupled":
+        short["lr_srl"] = 1e-4
     _, final = run(tmp_path / mode, f"catch/{mode}", encoder_from=str(source), **short)
     assert final > -0.45
 
