@@ -30,7 +30,7 @@ _PRETRAIN = {
     "pretrain_epsilon": 0.3,
 }
 
-# Catch in two to three minutes on two cores. Exploration, importance weights and learning rates are annealed
+# Catch in one to three minutes on two cores. Exploration, importance weights and learning rates are annealed
 # within the run; returns are -1 or 1.
 _CATCH = {
     "game": "Catch",
