@@ -90,7 +90,7 @@ def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path |
     """
     train = [row for row in rows if row["kind"] == "train"]
     keys = sorted({key for row in train for key in row if key.startswith("loss/")})
-    keys += sorted({key for row in train for key in row if key.split("/")[-1] == "grad_norm"})
+    keys += sorted({key for row in train for key in row if key.split("/")[0] == "grad_norm"})
     curves = []
     for key in keys:
         at = np.array([row["env_steps"] for row in train if row.get(key) is not None], float)
@@ -117,7 +117,7 @@ def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path |
             kernel = np.full(span, 1 / span)
             smooth = [np.convolve(curve, kernel, mode="valid") for curve in (at, values)]
             axes.plot(*smooth, color=COLOURS[0], linewidth=1.4)
-        axes.set_title(key.replace("grad_norm", "gradient norm"), fontsize=9)
+        axes.set_title(key.replace("grad_norm", "gradient norm").replace("norm/", "norm, "), fontsize=9)
         if values.min() > 0 and values.max() >= 5 * values.min():
             _log_axis(axes, values.max() / values.min())
         _count_axis(axes)

@@ -1,6 +1,7 @@
 """From a configuration to the functions that it means: encoder, objectives, update, act."""
 
 from collections.abc import Callable
+from functools import partial, wraps
 from typing import NamedTuple
 
 import jax
@@ -12,7 +13,25 @@ from srl_jax.modes import MODES, Mode, encoder_learning_rate
 from srl_jax.optim import RL, make_optimizer
 from srl_jax.rl import Algorithm
 from srl_jax.types import Context, Encoder, Objective
-from srl_jax.update import Hyper, make_act, make_init, make_update, periodic
+from srl_jax.update import Hyper, follow_every, make_act, make_follow, make_init, make_update, periodic
+
+
+def _donating_the_optimizers_state(update: Callable) -> Callable:
+    """The jitted update, (state, window, hyper) -> ...; of its state all but `opt_state` outlives the call.
+
+    XLA overwrites donated parameters before their last use, and so copies them first.
+    """
+
+    @partial(jax.jit, donate_argnums=1)
+    def donating(state, opt_state, window, hyper):
+        return update(state._replace(opt_state=opt_state), window, hyper)
+
+    @wraps(update)
+    def call(state, window, hyper):
+        return donating(state._replace(opt_state=None), state.opt_state, window, hyper)
+
+    call.jitted = donating
+    return call
 
 
 class Agent(NamedTuple):
@@ -24,7 +43,11 @@ class Agent(NamedTuple):
         algorithm: the RL algorithm; in mode pretrain it acts (if it acts at all) but is not trained.
         objectives: the terms of the loss by name, RL's among them where the mode runs it.
         horizon: K of the windows it asks for.
-        init, update: see `srl_jax.update`.
+        init: see `srl_jax.update.make_init`.
+        update: `srl_jax.update.make_update`'s, without moving slow copies. Takes over the buffers of the
+            optimizer's state, and no others: the parameters may still act while it runs.
+        update_rl: the update that computes RL's loss alone, where `srl_every` asks for one; else None.
+        follow: `srl_jax.update.make_follow`'s, to be called after every `follow_every` updates.
         act, act_eval: with noise, and without.
         hyper: the numbers of an update.
     """
@@ -36,6 +59,9 @@ class Agent(NamedTuple):
     horizon: int
     init: Callable
     update: Callable
+    update_rl: Callable | None
+    follow: Callable
+    follow_every: int
     act: Callable
     act_eval: Callable
     hyper: Hyper
@@ -75,6 +101,21 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         "rl": config.lr_rl,
         "representation": config.lr_srl,
     }
+
+    def jitted_update(only=None):
+        return _donating_the_optimizers_state(
+            make_update(
+                encoder,
+                terms,
+                mode,
+                optimizer,
+                augment=config.augment,
+                target_encoder=config.target_encoder,
+                only=only,
+                slow_follows=False,
+            )
+        )
+
     return Agent(
         mode=mode,
         encoder=encoder,
@@ -85,17 +126,10 @@ def make_agent(config: Config, num_actions: int) -> Agent:
             make_init(encoder, terms, mode, optimizer, target_encoder=config.target_encoder),
             compiler_options={"xla_backend_optimization_level": 0},  # it runs once: compile it fast
         ),
-        update=jax.jit(
-            make_update(
-                encoder,
-                terms,
-                mode,
-                optimizer,
-                augment=config.augment,
-                target_encoder=config.target_encoder,
-            ),
-            donate_argnums=0,
-        ),
+        update=jitted_update(),
+        update_rl=jitted_update({RL}) if config.srl_every > 1 else None,
+        follow=jax.jit(make_follow(terms)),
+        follow_every=follow_every(terms),
         act=jax.jit(make_act(encoder, algorithm.q_values, noisy=True)),
         act_eval=jax.jit(make_act(encoder, algorithm.q_values, noisy=False)),
         hyper=Hyper(

@@ -61,6 +61,9 @@ class Config:
         str, "none", "random shift of the frames that these losses see (srl: the representation's)",
         choices=("none", "srl", "all"),
     )  # fmt: skip
+    srl_every: int = _value(
+        int, 1, "representation losses are computed in every so manyth update", "updates", minimum=1
+    )
     target_encoder: str = _value(
         str, "slow", "encoder under the target network: its slow copy, or the online one",
         choices=("slow", "online"),

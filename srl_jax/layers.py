@@ -13,6 +13,9 @@ import jax.numpy as jnp
 
 from srl_jax.types import Array
 
+FEW_ROWS = 16
+"""A noisy layer of no more rows multiplies by mu and by sigma, and does not write down their noisy sum."""
+
 
 def uniform_fan_in(fan_in: int):
     """An initialiser: U(-1/sqrt(fan_in), 1/sqrt(fan_in)), for kernels and biases alike.
@@ -78,13 +81,15 @@ class Conv(nn.Module):
     Attributes:
         features: output channels.
         kernel, stride: in pixels.
-        on_image: whether the input is an image; its kernels then start `zero_sum`.
+        on_image: whether the input is an image, float32 or uint8; its kernels then start `zero_sum`.
+        gain: factor of the input.
     """
 
     features: int
     kernel: int
     stride: int
     on_image: bool = False
+    gain: float = 1.0
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -93,7 +98,7 @@ class Conv(nn.Module):
             init = zero_sum(init)
         kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        return _valid_conv(x, kernel, self.stride) + bias
+        return _valid_conv(x, kernel * self.gain, self.stride) + bias
 
 
 class ConvTranspose(nn.Module):
@@ -142,11 +147,22 @@ class ConvTranspose(nn.Module):
         return x[:, : self.size, : self.size] + bias
 
 
+def factorised_noise(key: Array, size: int) -> Array:
+    """f(e) = sign(e) sqrt(|e|) of standard normal e, float32 [size] (Fortunato et al. 2018, equation 11)."""
+    noise = jax.random.normal(key, (size,))
+    noise = jnp.sign(noise) * jnp.sqrt(jnp.abs(noise))
+    if not size:
+        return noise
+    # A branch, or XLA would compute the noise anew for every weight that it is multiplied with. Always the
+    # first one; the other is noise of the same distribution.
+    return jax.lax.cond(noise[0] > -100.0, lambda e: e, lambda e: -e, noise)
+
+
 class NoisyDense(nn.Module):
     """A linear layer with factorised Gaussian noise on its weights (Fortunato et al. 2018, section 3).
 
-    `y = x (mu + sigma * f(e_in) f(e_out)^T) + mu_b + sigma_b * f(e_out)`, with f(e) = sign(e) sqrt(|e|).
-    One draw serves the whole batch. Without noise the layer acts with its means.
+    `y = x (mu + sigma * f(e_in) f(e_out)^T) + mu_b + sigma_b * f(e_out)`. One draw serves the whole batch.
+    Without noise the layer acts with its means.
 
     Attributes:
         features: outputs.
@@ -158,7 +174,7 @@ class NoisyDense(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, noise: Array | None) -> Array:
-        """float32 [B, inputs], and e: standard normal [inputs + features] or None -> [B, features]."""
+        """float32 [B, inputs], and `factorised_noise` [inputs + features] or None -> [B, features]."""
         inputs = x.shape[-1]
         init = uniform_fan_in(inputs)
         sigma = nn.initializers.constant(self.std / math.sqrt(inputs))
@@ -168,13 +184,66 @@ class NoisyDense(nn.Module):
         bias_sigma = self.param("bias_sigma", sigma, (self.features,))
         if noise is None:
             return x @ kernel + bias
-        noise = jax.lax.optimization_barrier(jnp.sign(noise) * jnp.sqrt(jnp.abs(noise)))
         noise_in, noise_out = noise[:inputs], noise[inputs:]
-        kernel = kernel + kernel_sigma * (noise_in[:, None] * noise_out[None, :])
-        return x @ kernel + (bias + bias_sigma * noise_out)
+        bias = bias + bias_sigma * noise_out
+        if x.shape[0] <= FEW_ROWS:
+            return x @ kernel + ((x * noise_in) @ kernel_sigma) * noise_out + bias
+        return x @ (kernel + kernel_sigma * (noise_in[:, None] * noise_out[None, :])) + bias
 
 
 def _valid_conv(x: Array, kernel: Array, stride: int) -> Array:
+    """A VALID convolution of [B, H, W, C], H = W, with [k, k, C, features], as one of stride 1.
+
+    With stride s it is a convolution over blocks of s x s pixels, whose pixels are channels
+    (space-to-depth). A kernel that is no multiple of s is padded with zeros. Three times as fast on a CPU,
+    and its gradients are those of ordinary convolutions.
+    """
+    if stride > 1:
+        channels, k = x.shape[-1], kernel.shape[0]
+        taps = -(-k // stride)
+        blocks = (x.shape[1] - k) // stride + taps
+        x = _pad_to(x, blocks * stride)
+        of_bytes = x.dtype == jnp.uint8
+        x = _blocks_of_bytes(x, stride) if of_bytes else _blocks(x, stride)
+        kernel = jnp.pad(kernel, [(0, taps * stride - k)] * 2 + [(0, 0)] * 2)
+        kernel = kernel.reshape(taps, stride, taps, stride, channels, -1)
+        kernel = kernel.transpose((0, 2, 4, 1, 3, 5) if of_bytes else (0, 2, 1, 3, 4, 5))
+        kernel = kernel.reshape(taps, taps, stride * stride * channels, -1)
+    x = x.astype(jnp.float32)
     return jax.lax.conv_general_dilated(
-        x, kernel, (stride, stride), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        x, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
+
+
+def _pad_to(x: Array, size: int) -> Array:
+    """[B, H, H, C] cut or padded with zeros to [B, size, size, C]."""
+    x = x[:, :size, :size]
+    return jnp.pad(x, [(0, 0)] + [(0, size - x.shape[1])] * 2 + [(0, 0)])
+
+
+def _blocks(x: Array, s: int) -> Array:
+    """[B, H, H, C] -> [B, H / s, H / s, s * s * C]; channels stay together."""
+    batch, height, _, channels = x.shape
+    x = x.reshape(batch, height // s, s, height // s, s, channels).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(batch, height // s, height // s, s * s * channels)
+
+
+def _blocks_of_bytes(x: Array, s: int) -> Array:
+    """uint8 [B, H, H, C] -> uint8 [B, H / s, H / s, C * s * s]; the pixels of a row stay together.
+
+    Frames come from replay as [B, C, H, W], so those pixels are neighbours there, and moving them as one
+    word of 2 or 4 bytes makes XLA's loop over an image ten times as fast on a CPU.
+    """
+    batch, height, _, channels = x.shape
+    x = jnp.moveaxis(x, -1, 1).reshape(batch, channels, height // s, s, height // s, s)
+    width = next(n for n in (4, 2, 1) if s % n == 0)
+    word = {4: jnp.uint32, 2: jnp.uint16, 1: jnp.uint8}[width]
+    if width > 1:
+        x = jax.lax.bitcast_convert_type(x.reshape(*x.shape[:-1], s // width, width), word)
+    else:
+        x = x[..., None]
+    x = x.reshape(*x.shape[:5], -1)  # [B, C, rows of blocks, s, blocks of a row, words of a block's row]
+    x = x.transpose(0, 2, 4, 1, 3, 5)
+    if width > 1:
+        x = jax.lax.bitcast_convert_type(x, jnp.uint8)
+    return x.reshape(batch, height // s, height // s, channels * s * s)

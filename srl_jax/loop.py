@@ -1,12 +1,13 @@
 """The host loop: act, step, add, sample, update; evaluate, log, checkpoint.
 
-Apart from `checkpoint`, this is the only file that moves data between numpy and the device. The device
-updates while the environments step: an update is handed its window before the step and its priorities are
-fetched after it, always in this order, so that no result depends on timing.
+Apart from `checkpoint`, this is the only file that moves data between numpy and the device. The environments
+have a thread of their own, which acts and steps while the main thread has the device update. Both work on the
+parameters and the replay of the step before, and meet before the next one, so that no result depends on
+timing.
 """
 
 import time
-from collections import deque
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -70,6 +71,22 @@ def greedy_policy(agent: Agent, params: Any, key: jax.Array, *, noisy: bool = Fa
     return policy
 
 
+def act_and_step(policy: Policy, observations: np.ndarray, step: int, epsilon: float, env) -> tuple:
+    """One step of all environments: actions int32 [N], and what `env.step` returned."""
+    actions = policy(observations, step, epsilon)
+    return actions, env.step(actions)
+
+
+def means(log: list[dict[str, np.ndarray]]) -> dict[str, np.float32]:
+    """The mean of each metric over the updates that measured it: that have it, and not a norm that is NaN."""
+    values = {}
+    for row in log:
+        for name, x in row.items():
+            if not (name.startswith("grad_norm/") and np.isnan(x)):
+                values.setdefault(name, []).append(x)
+    return {name: np.float32(np.mean(x, dtype=np.float64)) for name, x in values.items()}
+
+
 def make_env(config: Config, num_envs: int, seed: int):
     """The environments of a run's game and protocol, see `srl_jax.envs.make`."""
     return envs.make(
@@ -106,10 +123,11 @@ class _Run:
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.key = jax.random.key(config.seed)
         self.state = self.agent.init(self.key, self.initial_encoder())
+        frame = self.env.single_observation_space.shape
         self.replay = Replay(
             capacity=config.buffer_size,
             num_streams=config.num_envs,
-            frame_shape=self.env.single_observation_space.shape,
+            frame_shape=frame,
             stack=config.frame_stack,
             horizon=self.agent.horizon,
             gamma=config.gamma,
@@ -121,12 +139,14 @@ class _Run:
         self.act_key = named_key(self.key, "act")
         self.eval_key = named_key(self.key, "eval")
         self.eval_env = None
+        self.env_thread = ThreadPoolExecutor(1, "environments")
+        self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
+        self.score = np.zeros(config.num_envs)  # of the training episodes so far
         self.env_steps = self.updates = 0
-        self.pending: deque[tuple[np.ndarray, jax.Array]] = deque()
         self.log: list[dict] = []  # metrics of the updates since the last row, still on the device
         self.returns: list[float] = []  # of the training episodes that ended since the last row
         self.evaluation = float("nan")
-        self.start = time.perf_counter()
+        self.started = time.perf_counter()
         self.progress = Progress(config.steps, stream=None if progress else _Nowhere())
         self.last_row = (0.0, 0)
 
@@ -135,13 +155,16 @@ class _Run:
         config = self.config
         interrupted = False
         events = self.out / "tensorboard" if config.tensorboard else None
-        with MetricsWriter(self.out / "metrics.jsonl", events) as self.writer, self.progress:
+        with (
+            MetricsWriter(self.out / "metrics.jsonl", events) as self.writer,
+            self.progress,
+            self.env_thread,
+        ):
             try:
                 self.run()
             except KeyboardInterrupt:
                 interrupted = True
                 self.progress.note(f"interrupted after {self.env_steps} env steps; saving")
-            self.finish_updates()
             self.save()
             pictures = self.pictures()
             self.env.close()
@@ -150,41 +173,14 @@ class _Run:
         return Result(self.env_steps, self.updates, interrupted, pictures)
 
     def run(self) -> None:
-        """The loop proper."""
+        """From the first reset to the last env step, or to the return that ends the run."""
         config = self.config
-        number = config.num_envs
-        frames, _ = self.env.reset()
-        stacks = FrameStack(number, config.frame_stack, frames.shape[1:])
-        stacks.begin(frames)
-        self.replay.begin(frames)
-        score = np.zeros(number)
+        self.start()
         if self.evaluates(0):
             return
         while self.env_steps < config.steps:
-            actions = self.act(stacks.observations())
-            for _ in range(self.due()):
-                self.finish_updates()
-                self.launch_update()
-            frames, rewards, terminated, truncated, info = self.env.step(actions)
-            score += rewards
-            stacks.push(frames)
-            self.finish_updates()
-            self.replay.add(
-                actions,
-                (np.sign(rewards) if config.reward_clip else rewards).astype(np.float32),
-                terminated,
-                truncated,
-                info["life_lost"] if config.life_loss else np.zeros(number, bool),
-                frames,
-            )
-            before, self.env_steps = self.env_steps, self.env_steps + number
-            over = terminated | truncated
-            if over.any():
-                self.returns += score[over].tolist()
-                score[over] = 0.0
-                frames, _ = self.env.reset(options={"reset_mask": over})
-                stacks.begin(frames, over)
-                self.replay.begin(frames[over], np.flatnonzero(over))
+            before = self.env_steps
+            self.step()
             if self.passed(before, config.log_every):
                 self.write_train_row()
             if self.passed(before, config.eval_every) and self.evaluates(self.env_steps):
@@ -193,17 +189,52 @@ class _Run:
                 self.save()
             self.progress.update(self.env_steps)
 
+    def start(self) -> None:
+        """Resets the training environments."""
+        frames, _ = self.env.reset()
+        self.stacks.begin(frames)
+        self.replay.begin(frames)
+
+    def step(self) -> None:
+        """One step of every environment, and the updates that are due.
+
+        Acting and stepping the environments have a thread of their own while the device updates. Both start
+        from the parameters and the replay of the step before, so that no result depends on timing.
+        """
+        config, number = self.config, self.config.num_envs
+        stepping = self.env_thread.submit(
+            act_and_step, self.policy, self.stacks.observations(), self.env_steps, self.epsilon, self.env
+        )
+        for _ in range(self.due()):
+            self.update()
+        actions, (frames, rewards, terminated, truncated, info) = stepping.result()
+        self.score += rewards
+        self.stacks.push(frames)
+        self.replay.add(
+            actions,
+            (np.sign(rewards) if config.reward_clip else rewards).astype(np.float32),
+            terminated,
+            truncated,
+            info["life_lost"] if config.life_loss else np.zeros(number, bool),
+            frames,
+        )
+        self.env_steps += number
+        over = terminated | truncated
+        if over.any():
+            self.returns += self.score[over].tolist()
+            self.score[over] = 0.0
+            frames, _ = self.env.reset(options={"reset_mask": over})
+            self.stacks.begin(frames, over)
+            self.replay.begin(frames[over], np.flatnonzero(over))
+
     # Acting
 
-    def act(self, observations: np.ndarray) -> np.ndarray:
-        """The behaviour policy's actions, int32 [N]."""
-        config = self.config
+    @property
+    def policy(self) -> Policy:
+        """The behaviour policy, of the parameters as they are now."""
         if self.agent.mode.rl:
-            policy = greedy_policy(self.agent, self.state.params, self.act_key, noisy=True)
-            return policy(observations, self.env_steps, self.epsilon)
-        if self.given is not None:
-            return self.given(observations, self.env_steps, config.pretrain_epsilon)
-        return self.random(observations, self.env_steps, 1.0)
+            return greedy_policy(self.agent, self.state.params, self.act_key, noisy=True)
+        return self.given or self.random
 
     @property
     def epsilon(self) -> float:
@@ -241,20 +272,20 @@ class _Run:
         steps = self.env_steps - config.learn_start + config.num_envs
         return int(steps * config.updates_per_step + 1e-9) - self.updates
 
-    def launch_update(self) -> None:
-        """Hands the device a window; does not wait."""
+    def update(self) -> None:
+        """One update, from sampling a window to setting its priorities; waits for the device."""
         window, indices = self.replay.sample(self.config.batch_size, self.beta)
-        self.state, td_error, metrics = self.agent.update(self.state, window, self.hyper)
+        rl_alone = self.updates % self.config.srl_every
+        update = self.agent.update_rl if rl_alone else self.agent.update
+        self.state, td_error, metrics = update(self.state, window, self.hyper)
         self.updates += 1
+        if self.agent.follow_every and self.updates % self.agent.follow_every == 0:
+            self.state = self.agent.follow(self.state)
         self.log.append(metrics)
-        self.pending.append((indices, td_error))
-
-    def finish_updates(self) -> None:
-        """Waits for the priorities of what was launched."""
-        while self.pending:
-            indices, td_error = self.pending.popleft()
-            if td_error is not None:
-                self.replay.set_priorities(indices, np.asarray(td_error))
+        if td_error is None:
+            jax.block_until_ready(metrics)  # or windows would pile up
+        else:
+            self.replay.set_priorities(indices, np.asarray(td_error))
 
     # Reporting
 
@@ -264,7 +295,7 @@ class _Run:
 
     def write_train_row(self) -> None:
         """A "train" row: means over the updates and episodes since the last one."""
-        now = time.perf_counter() - self.start
+        now = time.perf_counter() - self.started
         wall, steps = self.last_row
         values = {
             "epsilon": self.epsilon,
@@ -274,9 +305,7 @@ class _Run:
             "train/return_mean": float(np.mean(self.returns)) if self.returns else None,
             "wall_steps_per_s": (self.env_steps - steps) / max(now - wall, 1e-9),
         }
-        log = jax.device_get(self.log)
-        for name in log[0] if log else ():
-            values[name] = np.float32(np.mean([row[name] for row in log], dtype=np.float64))
+        values |= means(jax.device_get(self.log))
         self.writer.write("train", self.env_steps, self.updates, now, values)
         shown = {n.removeprefix("loss/"): v for n, v in values.items() if n.startswith("loss/")}
         shown.pop("total", None)
@@ -310,7 +339,7 @@ class _Run:
             "eval/lengths": played.lengths,
             "wall_eval_s": round(time.perf_counter() - began, 3),
         }
-        self.writer.write("eval", env_steps, self.updates, time.perf_counter() - self.start, values)
+        self.writer.write("eval", env_steps, self.updates, time.perf_counter() - self.started, values)
         self.progress.note(
             f"evaluation after {env_steps} env steps: mean return {self.evaluation:.2f} "
             f"over {len(played.returns)} games, {values['wall_eval_s']:.1f} s"

@@ -107,6 +107,12 @@ def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", comp
             f"--objective: --mode={mode.name} needs at least one, for example "
             "--objective=reconstruction:weight=1"
         )
+    if config.srl_every > 1 and not (mode.rl and mode.representation):
+        others = ", ".join(m.name for m in MODES.values() if m.rl and m.representation)
+        raise ConfigError(
+            f"--srl_every={config.srl_every}: --mode={mode.name} does not run both kinds of loss, give 1; "
+            f"modes that do: {others}"
+        )
     if config.policy_from and mode.rl:
         raise ConfigError(
             f"--policy_from={config.policy_from}: only --mode=pretrain reads it; "

@@ -13,12 +13,16 @@ RL = "rl"
 
 
 class Optimizer(NamedTuple):
-    """Adam over the groups that move.
+    """Adam over groups of parameters: the encoder and each head, those of them that move.
 
     Attributes:
-        init: trainable params -> state.
-        update: (grads, state, params, learning_rates) -> (params, state, gradient norm before clipping).
-            `learning_rates` is {"encoder": [], "rl": [], "representation": []}, traced scalars.
+        init: trainable params -> state, {"encoder": Adam's, "heads": {name: Adam's}} with the groups that
+            the params have.
+        update: (grads, state, params, learning_rates, measure) -> (params, state, norms). Grads and params
+            may leave out groups that the state has: those keep their moments and their count of steps.
+            `learning_rates` is {"encoder": [], "rl": [], "representation": []}, traced scalars. Norms are
+            {"encoder": of its gradient, NaN where `measure`, a traced bool, is false; "all": of the whole
+            gradient before clipping, where there is clipping}: each is a pass over the gradient.
     """
 
     init: object
@@ -44,37 +48,30 @@ def make_optimizer(
         adam_eps: Adam's epsilon.
     """
 
-    def decays(params: Params) -> Params:
-        return {
-            group: (
-                {name: _fill(head, objectives[name].is_decoder) for name, head in tree.items()}
-                if group == "heads"
-                else _fill(tree, False)
-            )
-            for group, tree in params.items()
-        }
+    adam = optax.scale_by_adam(eps=adam_eps)
 
-    chain = []
-    if max_grad_norm:
-        chain.append(optax.clip_by_global_norm(max_grad_norm))
-    if decoder_weight_decay:
-        chain.append(optax.add_decayed_weights(decoder_weight_decay, decays))
-    transform = optax.chain(*chain, optax.scale_by_adam(eps=adam_eps))
+    def init(params: Params):
+        return _nested({path: adam.init(tree) for path, tree in _groups(params).items()})
 
-    def update(grads, state, params, learning_rates: dict[str, Array]):
-        norm = optax.tree.norm(grads)
-        updates, state = transform.update(grads, state, params)
-        rates = {}
-        for group, tree in params.items():
-            if group == "heads":
-                kind = {n: RL if n == RL else "representation" for n in tree}
-                rates[group] = {n: _fill(t, learning_rates[kind[n]]) for n, t in tree.items()}
-            else:
-                rates[group] = _fill(tree, learning_rates[group])
-        params = jax.tree.map(lambda p, u, rate: p - rate * u, params, updates, rates)
-        return params, state, norm
+    def update(grads, state, params, learning_rates: dict[str, Array], measure: Array | bool = True):
+        norms = {}
+        if "encoder" in grads:
+            unknown = lambda _: jnp.float32(jnp.nan)  # noqa: E731
+            norms["encoder"] = jax.lax.cond(measure, optax.tree.norm, unknown, grads["encoder"])
+        if max_grad_norm:
+            norms["all"] = optax.tree.norm(grads)
+            factor = jnp.minimum(1.0, max_grad_norm / norms["all"])
+            grads = jax.tree.map(lambda g: g * factor, grads)
+        grads, states, trees = _groups(grads), _groups(state), _groups(params)
+        for path, tree in trees.items():
+            rate = learning_rates[_rate_of(path)]
+            if decoder_weight_decay and path[0] == "heads" and objectives[path[1]].is_decoder:
+                grads[path] = jax.tree.map(lambda g, p: g + decoder_weight_decay * p, grads[path], tree)
+            steps, states[path] = adam.update(grads[path], states[path])
+            trees[path] = jax.tree.map(lambda p, u: p - rate * u, tree, steps)  # noqa: B023
+        return _nested(trees), _nested(states), norms
 
-    return Optimizer(transform.init, update)
+    return Optimizer(init, update)
 
 
 def real_copy(params: Params) -> Params:
@@ -82,5 +79,21 @@ def real_copy(params: Params) -> Params:
     return jax.tree.map(lambda x: jnp.array(x, copy=True), params)
 
 
-def _fill(tree: Params, value) -> Params:
-    return jax.tree.map(lambda _: value, tree)
+def _groups(params: Params) -> dict[tuple[str, ...], Params]:
+    """{("encoder",): tree, ("heads", NAME): tree} of what {"encoder": tree, "heads": {NAME: tree}} has."""
+    groups = {("heads", name): tree for name, tree in params.get("heads", {}).items()}
+    return {("encoder",): params["encoder"], **groups} if "encoder" in params else groups
+
+
+def _nested(groups: dict[tuple[str, ...], Params]) -> Params:
+    """The inverse of `_groups`."""
+    heads = {path[1]: tree for path, tree in groups.items() if path[0] == "heads"}
+    encoder = {"encoder": groups[("encoder",)]} if ("encoder",) in groups else {}
+    return {**encoder, "heads": heads}
+
+
+def _rate_of(path: tuple[str, ...]) -> str:
+    """The name of a group's learning rate."""
+    if path[0] == "encoder":
+        return "encoder"
+    return RL if path[1] == RL else "representation"

@@ -1,7 +1,8 @@
 """make_init, make_update and make_act: the one place where losses are summed."""
 
+import math
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import jax
@@ -12,6 +13,9 @@ from srl_jax.modes import Mode
 from srl_jax.optim import RL, Optimizer, real_copy
 from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
 from srl_jax.window import observation, stack_last
+
+NORM_EVERY = 10
+"""The norm of the encoder's gradient, a pass over it, is a metric of every so many updates."""
 
 
 class Hyper(NamedTuple):
@@ -37,7 +41,26 @@ def periodic(every: int) -> Callable:
     def follow(new: Params, old: Params, step: Array) -> Params:
         return jax.lax.cond(step % every == 0, lambda: new, lambda: old)
 
+    follow.every = every
     return follow
+
+
+def follow_every(objectives: dict[str, Objective]) -> int:
+    """Updates after which a slow copy may change, in other words how often `make_follow` must be called.
+
+    A rule that has no attribute `every`, as `periodic` has, changes its copy in every update.
+    """
+    rules = [objective.slow for objective in objectives.values() if objective.slow]
+    return math.gcd(*(getattr(rule, "every", 1) for rule in rules))
+
+
+def make_follow(objectives: dict[str, Objective]) -> Callable:
+    """follow: TrainState, after an update -> TrainState, its slow copies moved by their rules; pure."""
+
+    def follow_all(state: TrainState) -> TrainState:
+        return state._replace(slow=follow(objectives, state.params, state.slow, state.step))
+
+    return follow_all
 
 
 def make_init(
@@ -63,7 +86,7 @@ def make_init(
         params = {"encoder": real_copy(encoder_params), "heads": heads}
         slow = {"heads": {n: heads[n] for n, o in objectives.items() if o.slow}}
         slow["encoder"] = params["encoder"] if slow["heads"] and target_encoder == "slow" else {}
-        trainable, _ = split(params, mode)
+        trainable, _ = split(params, mode, objectives)
         return TrainState(
             params=params,
             slow=real_copy(slow),
@@ -75,11 +98,20 @@ def make_init(
     return init
 
 
-def split(params: Params, mode: Mode) -> tuple[Params, Params]:
-    """The groups that move in a mode, and those that do not: two dicts that make up params together."""
-    moves = mode.rl_trains_encoder or mode.representation_trains_encoder
-    still = {} if moves else {"encoder": params["encoder"]}
-    return {group: tree for group, tree in params.items() if group not in still}, still
+def split(params: Params, mode: Mode, active: Collection[str]) -> tuple[Params, Params]:
+    """The groups that move where these objectives run in this mode, and those that do not; see `join`."""
+    moves = mode.rl_trains_encoder and RL in active
+    moves |= mode.representation_trains_encoder and any(name != RL for name in active)
+    trainable, still = {"heads": {}}, {"heads": {}}
+    (trainable if moves else still)["encoder"] = params["encoder"]
+    for name, head in params["heads"].items():
+        (trainable if name in active else still)["heads"][name] = head
+    return trainable, still
+
+
+def join(trainable: Params, still: Params) -> Params:
+    """The params that `split` took apart."""
+    return {**trainable, **still, "heads": {**trainable["heads"], **still["heads"]}}
 
 
 def make_update(
@@ -90,6 +122,8 @@ def make_update(
     *,
     augment: str = "none",
     target_encoder: str = "slow",
+    only: Collection[str] | None = None,
+    slow_follows: bool = True,
 ) -> Callable:
     """update: (TrainState, Window, Hyper) -> (TrainState, td_error [B] | None, metrics), pure; jit it once.
 
@@ -107,10 +141,16 @@ def make_update(
             does.
         target_encoder: "slow": the slow latents come from the encoder's slow copy; "online": from the
             online encoder, as in the thesis' code (without gradient either way).
+        only: the objectives that this update computes; None for all. The heads of the others do not move.
+        slow_follows: whether the slow copies move by their rules; False leaves that to `make_follow`, which
+            then must be called after every `follow_every` updates: an update that never writes to the slow
+            copies needs no copy of them.
 
     Returns:
         The update. Metrics are scalars on the device: `loss/NAME` (before its weight; RL's with its
-        importance weights), `loss/total`, `grad_norm`, `NAME/...` of each objective's own, `q_max`.
+        importance weights), `loss/total`, `grad_norm/encoder` (where it moves; NaN but in every
+        `NORM_EVERY`th update), `grad_norm/all` (where gradients are clipped; before that), `NAME/...` of
+        each objective's own.
     """
 
     if augment not in ("none", "srl", "all"):
@@ -118,23 +158,25 @@ def make_update(
     if target_encoder not in ("slow", "online"):
         raise ValueError(f"target_encoder must be slow or online, not {target_encoder}")
 
+    active = {n: o for n, o in objectives.items() if only is None or n in only}
+
     def update(state: TrainState, window: Window, hyper: Hyper):
         if set(hyper.weights) != set(objectives):
             raise ValueError(f"weights {sorted(hyper.weights)} for losses {sorted(objectives)}")
         key = jax.random.fold_in(state.key, state.step)
         shifted = window if augment == "none" else shift(window, named_key(key, "augment"))
         rl_view = window if augment == "srl" else shifted
-        trainable, still = split(state.params, mode)
+        trainable, still = split(state.params, mode, active)
 
         def summed(trainable: Params):
-            params = {**trainable, **still}
+            params = join(trainable, still)
             slow = state.slow["encoder"] if target_encoder == "slow" else params["encoder"]
             seen = make_latents(encoder, params["encoder"], slow, shifted)
             rl_seen = make_latents(encoder, params["encoder"], slow, rl_view)
             if rl_view is shifted:
                 rl_seen = seen
             losses, metrics = {}, {}
-            for name, objective in objectives.items():
+            for name, objective in active.items():
                 view, latents, opens = shifted, seen, mode.representation_trains_encoder
                 if name == RL:
                     view, latents, opens = rl_view, rl_seen, mode.rl_trains_encoder
@@ -149,14 +191,16 @@ def make_update(
             return total, (losses, metrics)
 
         (total, (losses, extra)), grads = jax.value_and_grad(summed, has_aux=True)(trainable)
-        moved, opt_state, norm = optimizer.update(grads, state.opt_state, trainable, hyper.learning_rates)
-        params = {**moved, **still}
+        moved, opt_state, norms = optimizer.update(
+            grads, state.opt_state, trainable, hyper.learning_rates, state.step % NORM_EVERY == 0
+        )
+        params = join(moved, still)
         step = state.step + 1
         td_error = extra.get(RL, {}).pop("td_error", None)
         metrics = {f"loss/{name}": jnp.mean(x) for name, x in losses.items()}
-        metrics |= {"loss/total": total, "grad_norm": norm}
+        metrics |= {"loss/total": total} | {f"grad_norm/{group}": norm for group, norm in norms.items()}
         metrics |= {f"{name}/{k}": x for name, values in extra.items() for k, x in values.items()}
-        slow = follow(objectives, params, state.slow, step)
+        slow = follow(objectives, params, state.slow, step) if slow_follows else state.slow
         return TrainState(params, slow, opt_state, step, state.key), td_error, metrics
 
     return update

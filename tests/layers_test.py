@@ -133,7 +133,7 @@ def test_zero_sum_takes_each_windows_mean():
 
 
 def test_noisy_dense_by_hand():
-    # Two inputs, one output; e = (4, -9, 0.25), so f(e_in) = (2, -3) and f(e_out) = 0.5.
+    # Two inputs, one output; f(e_in) = (2, -3) and f(e_out) = 0.5.
     # Weights 1 + 0.1 * 2 * 0.5 = 1.1 and 2 + 0.2 * -3 * 0.5 = 1.7; bias 3 + 0.4 * 0.5 = 3.2.
     params = {
         "kernel": np.array([[1.0], [2.0]]), "kernel_sigma": np.array([[0.1], [0.2]]),
@@ -142,7 +142,7 @@ def test_noisy_dense_by_hand():
     params = jax.tree.map(np.float32, params)
     apply = jit(lambda x, noise: NoisyDense(1).apply({"params": params}, x, noise))
     x = np.array([[1, 0], [0, 1], [10, 1]], np.float32)
-    y = apply(x, np.array([4, -9, 0.25], np.float32))
+    y = apply(x, np.array([2, -3, 0.5], np.float32))
     np.testing.assert_allclose(y[:, 0], [1.1 + 3.2, 1.7 + 3.2, 11 + 1.7 + 3.2], rtol=1e-6)
     # Without noise the means.
     np.testing.assert_allclose(apply(x, None)[:, 0], [4, 5, 15], rtol=1e-6)
@@ -159,8 +159,8 @@ def test_noisy_dense_noise_is_one_outer_product_in_the_size_of_its_sigmas():
     # The weights that act, read off by probing: zero shows the bias, the unit vectors the kernel.
     probe = np.concatenate([np.zeros((1, inputs)), np.eye(inputs)]).astype(np.float32)
     e = np.random.default_rng(0).normal(size=inputs + outputs).astype(np.float32)
-    y = np.asarray(jit(layer.apply)({"params": params}, probe, e), np.float64)
     f = np.sign(e) * np.sqrt(np.abs(e))
+    y = np.asarray(jit(layer.apply)({"params": params}, probe, f), np.float64)
     np.testing.assert_allclose((y[0] - params["bias"]) / sigma, f[inputs:], atol=1e-4)
     noise = (y[1:] - y[0] - params["kernel"]) / sigma
     np.testing.assert_allclose(noise, np.outer(f[:inputs], f[inputs:]), atol=1e-4)

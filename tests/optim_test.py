@@ -46,9 +46,9 @@ def ours(params, grads, **options):
     names = {"decay": "decoder_weight_decay", "clip": "max_grad_norm", "eps": "adam_eps"}
     optimizer = make_optimizer(OBJECTIVES, **{names[n]: value for n, value in options.items()})
     state, norms, update = optimizer.init(params), [], jit(optimizer.update)
-    for gradient in grads:
-        params, state, norm = update(gradient, state, params, RATES)
-        norms.append(float(norm))
+    for i, gradient in enumerate(grads):
+        params, state, norm = update(gradient, state, params, RATES, i != 1)
+        norms.append(norm)
     return leaves(params), norms
 
 
@@ -64,9 +64,14 @@ def test_steps_are_torch_adams_with_a_rate_for_each_group(options):
     expected = torch_adam(params, grads, **options)
     for name in expected:
         np.testing.assert_allclose(moved[name], expected[name], rtol=1e-5, atol=1e-6, err_msg=name)
-    # The norm is the one before clipping.
-    before = [np.sqrt(sum((g**2).sum() for g in leaves(gradient).values())) for gradient in grads]
-    np.testing.assert_allclose(norms, before, rtol=1e-5)
+    # Norms are those before clipping; the encoder's was not asked for at the second step.
+    encoder = [np.linalg.norm(gradient["encoder"]["kernel"]) for gradient in grads]
+    np.testing.assert_allclose([n["encoder"] for n in norms], [encoder[0], np.nan, encoder[2]], rtol=1e-5)
+    if "clip" in options:
+        before = [np.sqrt(sum((g**2).sum() for g in leaves(gradient).values())) for gradient in grads]
+        np.testing.assert_allclose([n["all"] for n in norms], before, rtol=1e-5)
+    else:
+        assert "all" not in norms[0]
 
 
 def test_decay_changes_decoders_alone_and_by_hand():
@@ -80,6 +85,26 @@ def test_decay_changes_decoders_alone_and_by_hand():
     p, g = (leaves(t)["reconstruction"] for t in (params, grads[0]))
     g = g + 0.5 * p
     np.testing.assert_allclose(decayed["reconstruction"], p - 0.001 * g / (np.abs(g) + 1), rtol=1e-5)
+
+
+def test_groups_that_are_left_out_keep_their_moments_and_their_count():
+    # Three steps of two groups, of which the head misses the second, equal two steps of the head alone.
+    optimizer = make_optimizer(OBJECTIVES)
+    update = jit(optimizer.update)
+    params, grads = tree(0), [tree(1), tree(2), tree(3)]
+    without = lambda t: {**t, "heads": {n: h for n, h in t["heads"].items() if n != "inverse"}}  # noqa: E731
+    state, some = optimizer.init(params), params
+    some, state, _ = update(grads[0], state, some, RATES)
+    moved, state, _ = update(without(grads[1]), state, without(some), RATES)
+    assert set(moved["heads"]) == {"rl", "reconstruction"}
+    some = {**moved, "heads": {**moved["heads"], "inverse": some["heads"]["inverse"]}}
+    some, _, _ = update(grads[2], state, some, RATES)
+    two, _ = ours(params, [grads[0], grads[2]])
+    three, _ = ours(params, grads)
+    some = leaves(some)
+    np.testing.assert_array_equal(some["inverse"], two["inverse"])
+    for name in ("encoder", "rl", "reconstruction"):
+        np.testing.assert_allclose(some[name], three[name], rtol=1e-6, err_msg=name)
 
 
 def test_rates_are_traced():

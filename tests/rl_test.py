@@ -189,7 +189,7 @@ def test_every_layer_has_noise_of_its_own_cut_from_one_draw(dueling):
     head, key = random_params(algorithm.objective.init), jax.random.key(5)
     (z, *_), *_ = make_case()
     lengths = [FEATURES + 8, 8 + ACTIONS] + ([FEATURES + 8, 8 + 1] if dueling else [])
-    noise = jax.random.normal(key, (sum(lengths),))
+    noise = np.asarray(jax.random.normal(key, (sum(lengths),)))
     expected = network(head, z, dueling, np.asarray(noise))[..., 0]
     np.testing.assert_allclose(jit(algorithm.q_values)(head, z, key), expected, rtol=1e-4, atol=1e-5)
 

@@ -45,9 +45,11 @@ class EncoderNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
-        x = to_unit(observation) * INPUT_GAIN
+        x = observation
+        gain = INPUT_GAIN / 255.0 if x.dtype == jnp.uint8 else INPUT_GAIN
         for i, layer in enumerate(self.layers):
-            x = nn.relu(Conv(*layer, on_image=i == 0)(x))
+            # The first kernel is multiplied by the gain, not the image: the same, with fewer bytes.
+            x = nn.relu(Conv(*layer, on_image=i == 0, gain=1.0 if i else gain)(x))
         x = x.reshape(x.shape[0], -1)
         if not self.features:
             return x

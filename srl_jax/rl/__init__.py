@@ -96,19 +96,21 @@ def rainbow(
         return output[..., 0]
 
     def q_values(head, latents, key=None):
-        return expected(network.apply({"params": head}, latents, key))
+        noise = None if key is None or not noisy else network.draw_noise(key, 1, context.encoder.features)[0]
+        return expected(network.apply({"params": head}, latents, noise))
 
     def loss(head, slow_head, latents: Latents, window: Window, key):
         r_t, discount_t, offset = n_step_view(window.rewards, window.discounts, window.valid, n_step)
         a_tm1 = window.actions[:, 0]
-        key_tm1, key_selector, key_slow = jax.random.split(key, 3)
-        out_tm1 = network.apply({"params": head}, latents.online(0), key_tm1)
-        slow_t = network.apply({"params": slow_head}, latents.slow(offset), key_slow)
+        # The online network has one draw of noise for both observations, and so the same weights.
+        online, slow = network.draw_noise(key, 2, context.encoder.features) if noisy else (None, None)
+        out_tm1 = network.apply({"params": head}, latents.online(0), online)
+        slow_t = network.apply({"params": slow_head}, latents.slow(offset), slow)
         slow_t = jax.lax.stop_gradient(slow_t)
         if double:
             z_t = jax.lax.stop_gradient(latents.online(offset))
             frozen = jax.lax.stop_gradient(head)
-            selector_t = expected(network.apply({"params": frozen}, z_t, key_selector))
+            selector_t = expected(network.apply({"params": frozen}, z_t, online))
         else:
             selector_t = expected(slow_t)
         if distributional:

@@ -1,11 +1,10 @@
 """The network on top of the latent: Q values or their distributions, dueling or not, noisy or not."""
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.layers import Dense, NoisyDense
+from srl_jax.layers import Dense, NoisyDense, factorised_noise
 from srl_jax.types import Array
 
 
@@ -29,22 +28,26 @@ class QNetwork(nn.Module):
     prior: tuple[float, ...] | None = None
 
     @nn.compact
-    def __call__(self, z: Array, key: Array | None) -> Array:
-        """float32 [B, D] -> float32 [B, A, M]: logits, or values where M is 1. No key, no noise."""
-        outputs = {"q": self.num_actions * self.atoms}
-        if self.dueling:
-            outputs["v"] = self.atoms
-        sizes = [(z.shape[-1], self.hidden, out) for out in outputs.values()]
-        noise = self._noise(key, sizes) if self.noisy and key is not None else [None] * 2 * len(sizes)
+    def __call__(self, z: Array, noise: Array | None) -> Array:
+        """float32 [B, D] -> float32 [B, A, M]: logits, or values where M is 1.
+
+        Args:
+            z: latents.
+            noise: a row of what `noise` draws; None acts with the means.
+        """
+        lengths = self._noise_lengths(z.shape[-1])
+        parts = [None] * len(lengths)
+        if self.noisy and noise is not None:
+            parts = jnp.split(noise, np.cumsum(lengths)[:-1].tolist())
 
         def layer(name: str, features: int, x: Array) -> Array:
             if self.noisy:
-                return NoisyDense(features, self.noisy_std, name=name)(x, noise.pop(0))
+                return NoisyDense(features, self.noisy_std, name=name)(x, parts.pop(0))
             return Dense(features, name=name)(x)
 
         def stream(name: str) -> Array:
             x = nn.relu(layer(f"{name}_hidden", self.hidden, z))
-            return layer(f"{name}_out", outputs[name], x).reshape(z.shape[0], -1, self.atoms)
+            return layer(f"{name}_out", self._outputs[name], x).reshape(z.shape[0], -1, self.atoms)
 
         prior = 0.0 if self.prior is None else jnp.asarray(self.prior, jnp.float32)
         q = stream("q")
@@ -52,10 +55,21 @@ class QNetwork(nn.Module):
             return q + prior
         return q - jnp.mean(q, 1, keepdims=True) + (stream("v") + prior)
 
-    def _noise(self, key: Array, sizes: list[tuple]) -> list[Array]:
-        """Each layer's noise, cut from one draw: every draw more costs compilation time."""
-        lengths = [n for inputs, hidden, out in sizes for n in (inputs + hidden, hidden + out)]
-        ends = np.cumsum(lengths)
-        # Meant to keep XLA from fusing the draw into the loop over weights; its gain is not measured.
-        noise = jax.lax.optimization_barrier(jax.random.normal(key, (int(ends[-1]),)))
-        return jnp.split(noise, ends[:-1].tolist())
+    def draw_noise(self, key: Array, rows: int, features: int) -> Array:
+        """Noise for so many networks over latents of that size: float32 [rows, ...], independent rows.
+
+        One draw for all: each draw more costs time, and more to compile.
+        """
+        size = sum(self._noise_lengths(features)) if self.noisy else 0
+        return factorised_noise(key, rows * size).reshape(rows, size)
+
+    @property
+    def _outputs(self) -> dict[str, int]:
+        """The outputs of each stream."""
+        outputs = {"q": self.num_actions * self.atoms}
+        return outputs | {"v": self.atoms} if self.dueling else outputs
+
+    def _noise_lengths(self, features: int) -> list[int]:
+        """The noise of each layer, in the order in which they are called."""
+        hidden = self.hidden
+        return [n for outputs in self._outputs.values() for n in (features + hidden, hidden + outputs)]
