@@ -3,12 +3,15 @@
 Prints one JSON object: the game, the checkpoint's env steps, the mean, and every return and length.
 """
 
+import functools
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 from absl import flags
 
 from experiments import flags as config_flags
+from experiments import runtime
 from srl_jax.specs import ConfigError
 
 FLAGS = flags.FLAGS
@@ -32,8 +35,14 @@ def check_gif(path: str) -> None:
         raise ConfigError(f"--gif={path}: no such directory")
 
 
-def main(argv: list[str]) -> None:
-    """The entry point."""
+def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> None:
+    """The entry point.
+
+    Args:
+        argv: the program's name.
+        prepare: called with --tune_runtime and the run's encoder before jax is imported. It may replace the
+            process, so only a process of our own gives it.
+    """
     del argv
     if not FLAGS.run:
         raise ConfigError("--run: missing; name a run directory or a checkpoint, --run=runs/NAME")
@@ -45,6 +54,8 @@ def main(argv: list[str]) -> None:
     config = checkpoint.read_manifest(FLAGS.run).config
     if not MODES[config.mode].rl:
         raise ConfigError(f"--run={FLAGS.run}: a run of --mode={config.mode} has no policy to play with")
+    if prepare is not None:
+        prepare(FLAGS.tune_runtime, config.encoder)
 
     import jax
 
@@ -85,4 +96,5 @@ if __name__ == "__main__":
         "epsilon", None, "probability of a random action; the run's eps_eval if not given", 0.0, 1.0
     )
     flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF")
-    config_flags.run(main)
+    config_flags.define_runtime_flag()
+    config_flags.run(functools.partial(main, prepare=runtime.prepare))

@@ -107,6 +107,12 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
     )
 
 
+def define_runtime_flag(values: flags.FlagValues = flags.FLAGS) -> None:
+    """Defines --tune_runtime, see `experiments.runtime`; no field of Config, for it changes no setting."""
+    help_text = "whether to set variables that make jax faster on a CPU, and to restart once if need be"
+    _define("tune_runtime", Info(str, help_text, choices=("auto", "off")), "auto", "", values)
+
+
 def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool = True) -> Config:
     """The settings that the command line asks for: defaults, then --preset, then the flags given.
 

@@ -5,16 +5,20 @@ checked without jax is checked before jax is imported.
 """
 
 import contextlib
+import dataclasses
+import functools
 import importlib.util
 import json
 import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 from absl import flags
 
 from experiments import flags as config_flags
-from srl_jax.config import Config, resolve
+from experiments import runtime
+from srl_jax.config import INFOS, Config, resolve
 from srl_jax.specs import ConfigError, build, parse
 
 FLAGS = flags.FLAGS
@@ -23,11 +27,41 @@ FLAGS = flags.FLAGS
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
     config_flags.define_config_flags(values)
+    config_flags.define_runtime_flag(values)
     flags.DEFINE_string("out", None, "run directory to make; must be new or empty", flag_values=values)
+    flags.DEFINE_string(
+        "seeds",
+        None,
+        "several seeds in this process, 0,1,2, instead of --seed: for an accelerator; a run directory each "
+        "in --out, seed0, seed1, ...",
+        flag_values=values,
+    )
     flags.DEFINE_boolean("overwrite", False, "delete the run that --out holds first", flag_values=values)
     flags.DEFINE_boolean(
         "print_config", False, "print the resolved config as JSON and exit", flag_values=values
     )
+
+
+def check_seeds(values: flags.FlagValues) -> list[int]:
+    """The seeds of --seeds; none where it was not given.
+
+    Raises:
+        ConfigError: they are not distinct integers, or --seed was given beside them.
+    """
+    text = values["seeds"].value
+    if text is None:
+        return []
+    if values["seed"].present:
+        raise ConfigError(f"--seeds={text}: given beside --seed={values['seed'].value}; give one of them")
+    try:
+        seeds = [INFOS["seed"].parse(part) for part in text.split(",")]
+        for seed in seeds:
+            INFOS["seed"].check(seed)
+    except ValueError as error:
+        raise ConfigError(f"--seeds={text}: {error}; give integers, as in --seeds=0,1,2") from None
+    if len(set(seeds)) < len(seeds):
+        raise ConfigError(f"--seeds={text}: a seed is there twice")
+    return seeds
 
 
 def check_extras(config: Config) -> None:
@@ -172,8 +206,13 @@ def resolved(config: Config) -> Config:
     return full
 
 
-def train(values: flags.FlagValues) -> None:
+def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = None) -> None:
     """Checks the command line, makes the run directory and trains.
+
+    Args:
+        values: parsed flags, as `define_flags` defines them.
+        prepare: called with --tune_runtime and the encoder before jax is imported, and only where a run
+            follows. It may replace the process, so only a process of our own gives it.
 
     Raises:
         ConfigError: the command line is not valid; nothing was written.
@@ -182,9 +221,12 @@ def train(values: flags.FlagValues) -> None:
     if values["print_config"].value:
         print(resolved(config).to_json())
         return
+    seeds = check_seeds(values)
     path = check_out(values["out"].value, values["overwrite"].value, config)
     check_extras(config)
     check_paths(config)
+    if prepare is not None:
+        prepare(values["tune_runtime"].value, config.encoder)
     config = resolved(config)
 
     from experiments import plots
@@ -192,21 +234,32 @@ def train(values: flags.FlagValues) -> None:
     from srl_jax import checkpoint, loop
 
     checkpoint.check_sources(config)
-    with run_directory(path, config):
-        result = loop.train(config, path)
+    runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
+    runs = runs or [(path, config)]
+    with contextlib.ExitStack() as directories:
+        for directory, its_config in runs:
+            directories.enter_context(run_directory(directory, its_config))
+        if seeds:
+            from srl_jax import lockstep
+
+            results = lockstep.train_seeds(config, seeds, [directory for directory, _ in runs])
+        else:
+            results = [loop.train(config, path)]
     if plots.available():
-        draw_run(path, config, pictures=result.pictures)
+        for (directory, its_config), result in zip(runs, results, strict=True):
+            draw_run(directory, its_config, pictures=result.pictures)
     else:
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
-    print(f"{result.env_steps} env steps, {result.updates} updates; everything is in {path}")
+    done = f"{results[0].env_steps} env steps, {results[0].updates} updates"
+    print(f"{done}{' of each seed' if seeds else ''}; everything is in {path}")
 
 
-def main(argv: list[str]) -> None:
-    """The entry point."""
+def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> None:
+    """The entry point; `prepare` as for `train`."""
     del argv
-    train(FLAGS)
+    train(FLAGS, prepare)
 
 
 if __name__ == "__main__":
     define_flags()
-    config_flags.run(main)
+    config_flags.run(functools.partial(main, prepare=runtime.prepare))

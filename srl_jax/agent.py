@@ -48,7 +48,10 @@ class Agent(NamedTuple):
             optimizer's state, and no others: the parameters may still act while it runs.
         update_rl: the update that computes RL's loss alone, where `srl_every` asks for one; else None.
         follow: `srl_jax.update.make_follow`'s, to be called after every `follow_every` updates.
-        act, act_eval: with noise, and without.
+        act: (state, frames, key, step, epsilon) -> actions, with noise; otherwise `make_act`'s.
+        act_eval: (params, frames, key, step, epsilon) -> actions, without noise.
+        fetch: list of updates' metrics -> the same on the host.
+        agree: (bool) -> whether all seeds of this process say so.
         hyper: the numbers of an update.
     """
 
@@ -64,6 +67,8 @@ class Agent(NamedTuple):
     follow_every: int
     act: Callable
     act_eval: Callable
+    fetch: Callable
+    agree: Callable
     hyper: Hyper
 
 
@@ -116,6 +121,11 @@ def make_agent(config: Config, num_actions: int) -> Agent:
             )
         )
 
+    def jitted_act(noisy: bool):
+        act = make_act(encoder, algorithm.q_values, noisy=noisy)
+        return jax.jit(lambda params, *rest: act(params["encoder"], params["heads"][RL], *rest))
+
+    act = jitted_act(noisy=True)
     return Agent(
         mode=mode,
         encoder=encoder,
@@ -130,8 +140,10 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         update_rl=jitted_update({RL}) if config.srl_every > 1 else None,
         follow=jax.jit(make_follow(terms)),
         follow_every=follow_every(terms),
-        act=jax.jit(make_act(encoder, algorithm.q_values, noisy=True)),
-        act_eval=jax.jit(make_act(encoder, algorithm.q_values, noisy=False)),
+        act=wraps(act.__wrapped__)(lambda state, *rest: act(state.params, *rest)),
+        act_eval=jitted_act(noisy=False),
+        fetch=jax.device_get,
+        agree=lambda said: said,
         hyper=Hyper(
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},

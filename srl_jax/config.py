@@ -8,6 +8,7 @@ silent, its code. "Env step" is one agent decision: four emulator frames.
 import dataclasses
 import importlib.metadata
 import json
+import os
 import platform
 import subprocess
 from collections.abc import Callable, Mapping
@@ -21,7 +22,7 @@ from srl_jax.specs import ConfigError, Info
 _PACKAGES = (
     "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
 )  # fmt: skip
-_ABOUT = ("versions", "git_revision")
+_ABOUT = ("versions", "git_revision", "environment")
 """What config.json holds beside the fields of Config."""
 
 
@@ -210,8 +211,9 @@ class Config:
             raise ConfigError(f"{path}: {error}") from None
 
     def save(self, run: str | Path) -> None:
-        """Writes a run's config.json: the fields, package versions and the git revision."""
-        about = {"versions": versions(), "git_revision": git_revision()}
+        """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told."""
+        told = {name: os.environ[name] for name in ("XLA_FLAGS", "JAX_PLATFORMS") if name in os.environ}
+        about = {"versions": versions(), "git_revision": git_revision(), "environment": told}
         text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)
         (Path(run) / "config.json").write_text(text + "\n", encoding="utf-8")
 

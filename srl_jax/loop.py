@@ -7,8 +7,10 @@ timing.
 """
 
 import time
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from threading import BrokenBarrierError
 from typing import Any, NamedTuple
 
 import jax
@@ -20,10 +22,9 @@ from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
 from srl_jax.evaluate import evaluate
 from srl_jax.metrics import MetricsWriter
-from srl_jax.optim import RL
 from srl_jax.progress import Progress
 from srl_jax.replay import Replay
-from srl_jax.types import TrainState, Window
+from srl_jax.types import Window
 from srl_jax.update import Hyper, make_latents, named_key
 
 PICTURES = 6
@@ -57,16 +58,17 @@ def train(config: Config, out: str | Path, *, progress: bool = True) -> Result:
     Raises:
         srl_jax.specs.ConfigError: a spec or a checkpoint to start from does not fit.
     """
-    return _Run(config, Path(out), progress).train()
+    return Run(config, Path(out), progress).train()
 
 
-def greedy_policy(agent: Agent, params: Any, key: jax.Array, *, noisy: bool = False) -> Policy:
-    """The epsilon-greedy policy of an agent's parameters, as a function of numpy arrays."""
-    act = agent.act if noisy else agent.act_eval
+def greedy_policy(agent: Agent, params: Any, key: jax.Array) -> Policy:
+    """The epsilon-greedy policy of an agent's parameters, without noise, as a function of numpy arrays."""
+    return _policy(agent.act_eval, params, key)
 
+
+def _policy(act: Callable, params_or_state: Any, key: jax.Array) -> Policy:
     def policy(frames: np.ndarray, step: int, epsilon: float) -> np.ndarray:
-        encoder, head = params["encoder"], params["heads"][RL]
-        return np.asarray(act(encoder, head, frames, key, np.int32(step), np.float32(epsilon)))
+        return np.asarray(act(params_or_state, frames, key, np.int32(step), np.float32(epsilon)))
 
     return policy
 
@@ -112,14 +114,14 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
     return agent, params, manifest
 
 
-class _Run:
+class Run:
     """One training run; its attributes are everything that changes while it runs."""
 
-    def __init__(self, config: Config, out: Path, progress: bool):
+    def __init__(self, config: Config, out: Path, progress: bool, agent: Agent | None = None):
         self.config, self.out = config, out
         self.env = self.make_env("train", config.num_envs)
         self.num_actions = int(self.env.single_action_space.n)
-        self.agent = make_agent(config, self.num_actions)
+        self.agent = agent or make_agent(config, self.num_actions)
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.key = jax.random.key(config.seed)
         self.state = self.agent.init(self.key, self.initial_encoder())
@@ -162,7 +164,7 @@ class _Run:
         ):
             try:
                 self.run()
-            except KeyboardInterrupt:
+            except (KeyboardInterrupt, BrokenBarrierError):  # the latter where another seed was the first
                 interrupted = True
                 self.progress.note(f"interrupted after {self.env_steps} env steps; saving")
             self.save()
@@ -233,7 +235,7 @@ class _Run:
     def policy(self) -> Policy:
         """The behaviour policy, of the parameters as they are now."""
         if self.agent.mode.rl:
-            return greedy_policy(self.agent, self.state.params, self.act_key, noisy=True)
+            return _policy(self.agent.act, self.state, self.act_key)
         return self.given or self.random
 
     @property
@@ -305,7 +307,7 @@ class _Run:
             "train/return_mean": float(np.mean(self.returns)) if self.returns else None,
             "wall_steps_per_s": (self.env_steps - steps) / max(now - wall, 1e-9),
         }
-        values |= means(jax.device_get(self.log))
+        values |= means(self.agent.fetch(self.log))
         self.writer.write("train", self.env_steps, self.updates, now, values)
         shown = {n.removeprefix("loss/"): v for n, v in values.items() if n.startswith("loss/")}
         shown.pop("total", None)
@@ -345,7 +347,8 @@ class _Run:
             f"over {len(played.returns)} games, {values['wall_eval_s']:.1f} s"
         )
         self.progress.update(env_steps, evaluation=self.evaluation)
-        return config.stop_at_return is not None and self.evaluation >= config.stop_at_return
+        solved = config.stop_at_return is not None and self.evaluation >= config.stop_at_return
+        return self.agent.agree(solved)
 
     def save(self) -> None:
         """Writes a checkpoint."""
@@ -365,13 +368,11 @@ class _Run:
             return {}
         window, _ = self.replay.sample(PICTURES, self.beta)
 
-        def draw(state: TrainState, window: Window):
-            encoder, encoder_params = self.agent.encoder, state.params["encoder"]
-            latents = make_latents(encoder, encoder_params, encoder_params, window)
-            heads = state.params["heads"]
-            return {name: image(heads[name], latents, window) for name, image in drawn.items()}
+        def draw(params: Any, window: Window):
+            latents = make_latents(self.agent.encoder, params["encoder"], params["encoder"], window)
+            return {name: image(params["heads"][name], latents, window) for name, image in drawn.items()}
 
-        made = jax.device_get(jax.jit(draw)(self.state, window))
+        made = jax.device_get(jax.jit(draw)(self.state.params, window))
         stack = self.config.frame_stack
         inputs = np.moveaxis(window.frames[:, :stack], 1, -1).astype(np.float32) / 255.0
         return {name: (inputs, target, output) for name, (target, output) in made.items()}

@@ -34,6 +34,21 @@ class Loop(types.ModuleType):
         return types.SimpleNamespace(env_steps=0, updates=0, pictures={})
 
 
+def test_seeds_get_a_run_directory_each(loop, tmp_path, monkeypatch):
+    lockstep = types.ModuleType("srl_jax.lockstep")
+
+    def train_seeds(config, seeds, outs):
+        return [loop.train(config, out) for _, out in zip(seeds, outs, strict=True)]
+
+    lockstep.train_seeds = train_seeds
+    monkeypatch.setitem(sys.modules, "srl_jax.lockstep", lockstep)
+    monkeypatch.setattr(srl_jax, "lockstep", lockstep, raising=False)
+    _train("--game=Catch", "--seeds=4,0", f"--out={tmp_path / 'runs'}")
+    assert [out.name for _, out in loop.calls] == ["seed4", "seed0"]
+    seeds = [Config.load(tmp_path / "runs" / name).seed for name in ("seed4", "seed0")]
+    assert seeds == [4, 0]
+
+
 @pytest.fixture
 def loop(monkeypatch):
     stub = Loop()
@@ -138,6 +153,13 @@ BAD = [
     (["--gamma=1.5"], "--gamma=1.5", "at most 1"),
     (["--n_step=0"], "--n_step=0", "at least 1"),
     (["--reward_clip=maybe"], "--reward_clip=maybe", "true or false"),
+    (["--srl_every=4"], "--srl_every=4", "joint, decoupled"),
+    (["--srl_every=0", *JOINT], "--srl_every=0", "at least 1"),
+    (["--seeds=1,2,1"], "--seeds=1,2,1", "twice"),
+    (["--seeds=1,b"], "--seeds=1,b", "not a whole number; give integers"),
+    (["--seeds=0,-1"], "--seeds=0,-1", "at least 0"),
+    (["--seeds="], "--seeds=", "give integers"),
+    (["--seeds=0,1", "--seed=2"], "--seeds=0,1", "--seed=2; give one of them"),
     (["--tune_runtime=x"], "--tune_runtime=x", "valid: auto, off"),
     (["--steps"], "--steps", ""),
     (["--gane=Pong"], "--gane", "did you mean --game?"),

@@ -169,7 +169,7 @@ def test_early_stop(tmp_path):
 
 def test_updates_are_compiled_once(joint):
     del joint
-    run = loop._Run(Config(**SMALL, lr_final=0.5), None, False)
+    run = loop.Run(Config(**SMALL, lr_final=0.5), None, False)
     from srl_jax.replay import Window  # the type that replay gives
 
     run.replay.begin(run.env.reset()[0])
@@ -203,7 +203,7 @@ def test_learning_rates_fall_linearly_to_the_share_that_is_left():
         run = SimpleNamespace(
             agent=SimpleNamespace(hyper=hyper), config=config, env_steps=env_steps, learning_rates=rates
         )
-        return loop._Run.hyper.fget(run)
+        return loop.Run.hyper.fget(run)
 
     assert at(150) is hyper  # by default they stay as they are
     assert at(0, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 4e-3})

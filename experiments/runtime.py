@@ -1,0 +1,250 @@
+"""The environment that jax and XLA's CPU backend run well in, set before jax is imported.
+
+Only an entry point's `__main__` calls `prepare`; nothing here is for library code. Imports no jax.
+
+jax and XLA read their variables when they are imported or first used, so those are set in `os.environ`.
+glibc reads its own when the process starts, so for those alone the process replaces itself, once.
+"""
+
+import hashlib
+import importlib.metadata
+import importlib.util
+import json
+import os
+import platform
+import re
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Mapping, MutableMapping
+from pathlib import Path
+
+GUARD = "SRL_JAX_RUNTIME"
+"""Set in the process that `prepare` started; such a process is not started again."""
+
+MALLOC = {
+    "MALLOC_MMAP_MAX_": "0",
+    "MALLOC_TRIM_THRESHOLD_": "1000000000000",
+    "MALLOC_ARENA_MAX": "1",
+    "GLIBC_TUNABLES": "glibc.malloc.hugetlb=1",
+}
+"""glibc's malloc keeps the memory that it was given, in one heap for all threads, of large pages. XLA
+allocates its temporaries afresh for every update; without these the kernel takes the pages back and hands
+them out again, zeroed, each time."""
+
+_YNN = (
+    "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT,LIBRARY_FUSION_TYPE_REDUCE",
+)
+XLA_FLAGS = {"nature": _YNN, "sac_ae": _YNN}
+"""{encoder: XLA flags that make its updates faster on a CPU}: products and reductions by the YNNPACK library.
+That pays where they are large, so not for `tiny`."""
+
+_PROBE = """
+import numpy as np
+import jax
+import jax.numpy as jnp
+
+rng = np.random.default_rng(0)
+x = rng.standard_normal((4, 9, 9, 3)).astype("f")
+w = rng.standard_normal((3, 3, 3, 5)).astype("f")
+y = rng.standard_normal((4, 4, 4, 5)).astype("f")
+a, b = rng.standard_normal((2, 48, 48)).astype("f")
+
+def loss(w):
+    out = jax.lax.conv_general_dilated(x, w, (2, 2), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
+    return jnp.sum(out * y), out
+
+(total, out), grad = jax.jit(jax.value_and_grad(loss, has_aux=True))(w)
+patches = np.stack([x[:, i : i + 7 : 2, j : j + 7 : 2] for i in range(3) for j in range(3)], 3)
+patches = patches.reshape(4, 4, 4, 3, 3, 3)
+want = np.einsum("nhwijc,ijco->nhwo", patches, w)
+close = dict(rtol=1e-4, atol=1e-4)
+np.testing.assert_allclose(out, want, **close)
+np.testing.assert_allclose(total, np.sum(want * y), **close)
+np.testing.assert_allclose(grad, np.einsum("nhwijc,nhwo->ijco", patches, y), **close)
+np.testing.assert_allclose(jax.jit(jnp.matmul)(a, b), a @ b, **close)
+"""
+
+
+def cache_folder(env: Mapping[str, str]) -> Path | None:
+    """`srl_jax` in the user's cache directory, made if need be; None unless it is ours alone to write."""
+    root = env.get("XDG_CACHE_HOME", "")
+    try:
+        folder = (Path(root) if os.path.isabs(root) else Path.home() / ".cache") / "srl_jax"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        info = folder.stat()
+    except (OSError, RuntimeError):
+        return None
+    # What lies there is executed: jax loads compiled code from it.
+    private = info.st_uid == os.geteuid() and not info.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return folder if private and os.access(folder, os.W_OK | os.X_OK) else None
+
+
+def has_glibc() -> bool:
+    """Whether this process' C library is the GNU one."""
+    try:
+        return (os.confstr("CS_GNU_LIBC_VERSION") or "").startswith("glibc")
+    except (AttributeError, ValueError, OSError):
+        return False
+
+
+def has_gpu(env: Mapping[str, str], device: str = "/dev/nvidia0") -> bool:
+    """Whether jax will take an NVIDIA GPU: device and plugin are there, and JAX_PLATFORMS allows it."""
+    first = env.get("JAX_PLATFORMS", "").split(",")[0].strip()
+    plugin = importlib.util.find_spec("jax_plugins") is not None
+    return os.path.exists(device) and plugin and first in ("", "cuda", "gpu")
+
+
+def machine() -> str:
+    """A name for the kind of processor, of its architecture, model and instruction sets as far as known."""
+    found = [platform.machine()]
+    try:
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
+    except OSError:
+        text = ""
+    for name in ("model name", "flags", "Features"):
+        found += re.findall(rf"^{name}\s*:.*$", text, re.MULTILINE)[:1]
+    return hashlib.sha256("\n".join(found).encode()).hexdigest()[:12]
+
+
+def with_flags(present: str, flags: tuple[str, ...]) -> str:
+    """XLA_FLAGS with the flags appended that it does not set; as it is where it names a file of flags."""
+    if present.strip() and not present.lstrip().startswith("-"):
+        return present
+    names = {flag.split("=")[0] for flag in present.split()}
+    return " ".join([*present.split(), *(flag for flag in flags if flag.split("=")[0] not in names)])
+
+
+def wanted(
+    env: Mapping[str, str],
+    encoder: str,
+    *,
+    glibc: bool,
+    gpu: bool,
+    cache: Path | None,
+    works: Callable[[str], bool],
+) -> dict[str, str]:
+    """The variables to set, with their values; none that the user has set, but for XLA_FLAGS, which grows.
+
+    Args:
+        env: the present environment.
+        encoder: a specification.
+        glibc: whether the process has glibc's malloc.
+        gpu: whether jax will run on a GPU; what is for a CPU is then left out.
+        cache: where jax may keep what it compiled, None for nowhere.
+        works: whether XLA takes these XLA_FLAGS; asked only if there are new ones.
+    """
+    found = {}
+    if glibc and not gpu and "glibc.malloc" not in env.get("GLIBC_TUNABLES", ""):
+        found |= MALLOC
+    if cache is not None and "JAX_COMPILATION_CACHE_DIR" not in env:
+        found["JAX_COMPILATION_CACHE_DIR"] = str(cache)
+        found["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+        found["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
+    found = {name: value for name, value in found.items() if name not in env}
+    present = env.get("XLA_FLAGS", "")
+    new = with_flags(present, () if gpu else XLA_FLAGS.get(encoder.split(":")[0], ()))
+    if new.split() != present.split() and works(new):
+        found["XLA_FLAGS"] = new
+    return found
+
+
+def probe(xla_flags: str) -> bool | None:
+    """Whether XLA takes these flags and computes correctly with them; None where there is no telling.
+
+    XLA ends a process whose flags it does not know, so another one tries.
+    """
+    env = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
+    env |= {"XLA_FLAGS": xla_flags, "JAX_PLATFORMS": "cpu"}
+    try:
+        done = subprocess.run(
+            [sys.executable, "-c", _PROBE],
+            env=env,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            timeout=60,
+        )
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.returncode == 0
+
+
+def remembered(xla_flags: str, folder: Path | None) -> bool:
+    """`probe`, whose answers are kept in `folder/runtime.json` for the same versions and processor."""
+    versions = [f"{name} {importlib.metadata.version(name)}" for name in ("jax", "jaxlib", "numpy")]
+    key = json.dumps([*versions, f"python {platform.python_version()}", machine(), xla_flags])
+    answers = {}
+    if folder is not None:
+        try:
+            read = json.loads((folder / "runtime.json").read_text(encoding="utf-8"))
+            answers = {k: v for k, v in read.items() if isinstance(v, bool)}
+        except (OSError, ValueError, AttributeError, RecursionError):
+            pass  # None yet, or damaged: asked again.
+    if key in answers:
+        return answers[key]
+    _say("trying an XLA flag for this encoder, which takes some seconds; once for this machine")
+    answer = probe(xla_flags)
+    if folder is not None and answer is not None:
+        _write(folder / "runtime.json", json.dumps(answers | {key: answer}, indent=1))
+    return bool(answer)
+
+
+def _write(path: Path, text: str) -> None:
+    """Writes a file at once or, where that cannot be done, not at all."""
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=path.name, dir=path.parent)
+    except OSError:
+        return
+    try:
+        with open(handle, "w", encoding="utf-8") as file:
+            file.write(text)
+        os.replace(temporary, path)
+    except OSError:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def _say(text: str) -> None:
+    print(f"runtime: {text}", file=sys.stderr, flush=True)
+
+
+def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ) -> None:
+    """Sets what `wanted` names, starting the program again if that is what it takes; says so in one line.
+
+    Does not return where it starts the program again.
+
+    Args:
+        tune: the value of --tune_runtime; "off" leaves everything alone.
+        encoder: the run's, a specification.
+        env: the environment to set.
+    """
+    if tune == "off":
+        return
+    folder = cache_folder(env)
+    # One machine's code need not run on another that shares the home directory.
+    cache = folder and folder / "xla" / machine()
+    new = wanted(
+        env,
+        encoder,
+        glibc=has_glibc(),
+        gpu=has_gpu(env),
+        cache=cache,
+        works=lambda flags: remembered(flags, folder),
+    )
+    hint = "(--tune_runtime=off leaves the environment alone)"
+    if MALLOC.keys() & new.keys() and GUARD not in env and sys.executable:
+        _say(f"restarting with {_shown(new)} {hint}")
+        sys.stdout.flush()
+        try:
+            os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**env, **new, GUARD: "tuned"})
+        except OSError as error:
+            _say(f"not restarted: {error.strerror}")
+    new = {name: value for name, value in new.items() if name not in MALLOC}
+    if new:
+        _say(f"running with {_shown(new)} {hint}")
+        env.update(new)
+
+
+def _shown(variables: Mapping[str, str]) -> str:
+    return " ".join(f"{name}={value}" for name, value in variables.items())

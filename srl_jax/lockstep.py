@@ -1,0 +1,205 @@
+"""Several seeds in one process: each has a loop of its own in a thread; calls of the device are shared.
+
+The loop is written for one seed. Here N of them run the same configuration in step: when all have asked for
+an update (or an action), one of them makes the vmapped call for all, and each takes its part of the result.
+Calls are collected by seed, not by arrival, so that no result depends on timing. Worth it on an accelerator;
+on a CPU one process for each seed is faster.
+"""
+
+import concurrent.futures
+import contextlib
+import dataclasses
+import threading
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from threading import BrokenBarrierError
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from srl_jax.agent import Agent, make_agent
+from srl_jax.config import Config
+from srl_jax.loop import Result, Run, make_env
+from srl_jax.types import Params, TrainState
+
+
+def train_seeds(
+    config: Config, seeds: Sequence[int], outs: Sequence[str | Path], *, progress: bool = True
+) -> list[Result]:
+    """Trains agents of several seeds in this process, in step.
+
+    Each has replay, environments, and a run directory as from `train`. Only the first shows its progress. A
+    return that ends a run early must be reached by all in one evaluation. Ctrl-C ends all, and all are saved.
+
+    Args:
+        config: of the runs, resolved; its seed does not matter.
+        seeds: distinct.
+        outs: their run directories.
+        progress: whether the first draws a progress bar on stderr.
+
+    Raises:
+        srl_jax.specs.ConfigError: a spec or a checkpoint to start from does not fit.
+    """
+    number = len(seeds)
+    configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
+    with contextlib.closing(make_env(config, 1, 0)) as env:
+        agent = make_agent(config, int(env.single_action_space.n))
+    lockstep = Lockstep(agent, number)
+
+    def one(i: int) -> Result:
+        finished = False
+        try:
+            result = Run(configs[i], Path(outs[i]), progress and i == 0, lockstep.agents[i]).train()
+            finished = not result.interrupted
+            return result
+        finally:
+            if not finished:
+                lockstep.leave()
+
+    with concurrent.futures.ThreadPoolExecutor(number, "seed") as threads:
+        runs = [threads.submit(one, i) for i in range(number)]
+        try:
+            concurrent.futures.wait(runs)
+        except KeyboardInterrupt:
+            lockstep.leave()
+    failed = [run.exception() for run in runs if run.exception()]
+    # Those that waited for the one that failed have nothing to say.
+    for error in sorted(failed, key=lambda e: isinstance(e, BrokenBarrierError)):
+        raise error
+    return [run.result() for run in runs]
+
+
+class Together:
+    """A function of N seeds' arguments that N threads call, each for its own seed.
+
+    Args:
+        function: list of N tuples of arguments, by seed -> N results, by seed.
+        number: N.
+    """
+
+    def __init__(self, function: Callable[[list[tuple]], Any], number: int):
+        self._function = function
+        self._arguments: list[tuple] = [()] * number
+        self._barrier = threading.Barrier(number, self._call)
+
+    def member(self, seed: int) -> Callable:
+        """One seed's side: takes its arguments, waits for the others, returns its result.
+
+        The call raises what the function raised in the thread that called it, and `BrokenBarrierError` in
+        the others, now and for good; likewise after `leave`.
+        """
+
+        def call(*arguments):
+            self._arguments[seed] = arguments
+            self._barrier.wait()
+            return self._results[seed]
+
+        return call
+
+    def leave(self) -> None:
+        """Ends it: whoever waits, or comes later, gets a `BrokenBarrierError`."""
+        self._barrier.abort()
+
+    def _call(self) -> None:
+        arguments, self._arguments = self._arguments, [()] * len(self._arguments)
+        self._results = self._function(arguments)
+
+
+class Share:
+    """One seed's part of a tree of stacked arrays [N, ...]; sliced when it is asked for."""
+
+    def __init__(self, stacked: Any, seed: int):
+        self.stacked, self.seed = stacked, seed
+
+    @property
+    def params(self) -> Params:
+        """Of a `TrainState`: this seed's parameters."""
+        return _slice(self.stacked.params, self.seed)
+
+
+_slice = jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree))
+
+
+class Lockstep:
+    """The agents of N seeds that update and act together.
+
+    Attributes:
+        agents: by seed; each to be used by one loop, in threads of its own. States are `Share`s.
+    """
+
+    def __init__(self, agent: Agent, number: int):
+        self._number = number
+        self._calls: list[Together] = []
+        shares = {
+            "init": self._together(self._init(agent)),
+            "update": self._together(self._update(agent.update)),
+            "update_rl": self._together(self._update(agent.update_rl)) if agent.update_rl else None,
+            "follow": self._together(self._follow(agent)),
+            "act": self._together(self._act(agent)),
+            "agree": self._together(lambda arguments: [all(a for (a,) in arguments)] * number),
+        }
+        self.agents = [
+            agent._replace(fetch=_fetch, **{name: c.member(i) if c else None for name, c in shares.items()})
+            for i in range(number)
+        ]
+
+    def leave(self) -> None:
+        """Ends all calls, so that no loop waits for one that has failed or was interrupted."""
+        for call in self._calls:
+            call.leave()
+
+    def _together(self, function: Callable) -> Together:
+        self._calls.append(Together(function, self._number))
+        return self._calls[-1]
+
+    def _parts(self, stacked: Any) -> list[Share]:
+        return [Share(stacked, i) for i in range(self._number)]
+
+    def _init(self, agent: Agent) -> Callable:
+        stack = jax.jit(lambda states: jax.tree.map(lambda *x: jnp.stack(x), *states))
+        # One after the other, so that each seed starts as it would alone, to the bit.
+        return lambda arguments: self._parts(stack([agent.init(*a) for a in arguments]))
+
+    def _update(self, update: Callable) -> Callable:
+        several = jax.vmap(update.__wrapped__, in_axes=(0, 0, None))
+
+        def stacked(state: TrainState, opt_state: Any, windows: list, hyper: Any):
+            window = jax.tree.map(lambda *x: jnp.stack(x), *windows)  # on the device: the host copies nothing
+            return several(state._replace(opt_state=opt_state), window, hyper)
+
+        stacked = jax.jit(stacked, donate_argnums=1)
+
+        def function(arguments: list[tuple]) -> list[tuple]:
+            (share, _, hyper), *_ = arguments
+            state = share.stacked
+            state, td_error, metrics = stacked(
+                state._replace(opt_state=None), state.opt_state, [window for _, window, _ in arguments], hyper
+            )
+            rows = [None] * self._number if td_error is None else np.asarray(td_error)
+            return list(zip(self._parts(state), rows, self._parts(metrics), strict=True))
+
+        return function
+
+    def _follow(self, agent: Agent) -> Callable:
+        follow = jax.jit(jax.vmap(agent.follow.__wrapped__))
+        return lambda arguments: self._parts(follow(arguments[0][0].stacked))
+
+    def _act(self, agent: Agent) -> Callable:
+        several = jax.vmap(agent.act.__wrapped__, in_axes=(0, 0, 0, None, None))
+
+        @jax.jit
+        def stacked(params, frames: list, keys: list, step, epsilon):
+            return several(params, jnp.stack(frames), jnp.stack(keys), step, epsilon)
+
+        def function(arguments: list[tuple]) -> np.ndarray:
+            shares, frames, keys, steps, epsilons = zip(*arguments, strict=True)
+            return np.asarray(stacked(shares[0].stacked.params, frames, keys, steps[0], epsilons[0]))
+
+        return function
+
+
+def _fetch(log: list[Share]) -> list[dict[str, np.ndarray]]:
+    """The metrics of a seed's updates, on the host."""
+    return [{name: x[row.seed] for name, x in jax.device_get(row.stacked).items()} for row in log]

@@ -1,0 +1,117 @@
+"""srl_jax/lockstep.py: several seeds in one process are the runs that they would be alone."""
+
+import threading
+
+import numpy as np
+import pytest
+
+from srl_jax import checkpoint, loop
+from srl_jax.config import Config
+from srl_jax.lockstep import Together, train_seeds
+from srl_jax.metrics import read_metrics
+from srl_jax.specs import ConfigError
+
+CONFIG = dict(
+    game="Catch", mode="joint", frame_size=42, encoder="tiny:features=8", objectives=("inverse",), num_envs=2,
+    rl="rainbow:hidden=8,atoms=5,v_min=-1,v_max=1", buffer_size=200, batch_size=4, updates_per_step=0.25,
+    learn_start=40, steps=120, eval_every=60, eval_games=2, log_every=20, slow_update_every=4, srl_every=2,
+)  # fmt: skip
+
+
+def in_threads(functions):
+    """What each returned or raised."""
+    results = [None] * len(functions)
+
+    def run(i):
+        try:
+            results[i] = functions[i]()
+        except Exception as error:
+            results[i] = error
+
+    threads = [threading.Thread(target=run, args=(i,)) for i in range(len(functions))]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(timeout=60)
+    assert not any(thread.is_alive() for thread in threads)
+    return results
+
+
+def test_together_collects_by_seed_and_calls_once():
+    calls = []
+    together = Together(lambda arguments: calls.append(arguments) or [a * b for a, b in arguments], 3)
+    results = in_threads([lambda i=i: [together.member(i)(i, 2), together.member(i)(i, 5)] for i in range(3)])
+    assert calls == [[(0, 2), (1, 2), (2, 2)], [(0, 5), (1, 5), (2, 5)]]
+    assert results == [[0, 0], [2, 5], [4, 10]]
+
+
+def test_an_error_ends_it_for_all():
+    def fail(arguments):
+        raise ValueError("broken")
+
+    together = Together(fail, 3)
+    results = in_threads([lambda i=i: together.member(i)() for i in range(3)])
+    kinds = sorted(type(error).__name__ for error in results)
+    assert kinds == ["BrokenBarrierError", "BrokenBarrierError", "ValueError"]
+    with pytest.raises(threading.BrokenBarrierError):
+        together.member(0)()
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """(rows of seeds 7 and 3 together, rows of seed 3 alone)."""
+    path = tmp_path_factory.mktemp("runs")
+    for name in ("s7", "s3", "alone"):
+        (path / name).mkdir()
+    results = train_seeds(Config(**CONFIG), [7, 3], [path / "s7", path / "s3"], progress=False)
+    alone = loop.train(Config(**CONFIG, seed=3), path / "alone", progress=False)
+    assert [r.updates for r in results] == [alone.updates] * 2 == [20, 20]
+    assert all((path / name / "checkpoints").is_dir() for name in ("s7", "s3"))
+    return [read_metrics(path / name / "metrics.jsonl") for name in ("s7", "s3", "alone")]
+
+
+def test_a_seed_in_company_is_the_seed_alone(runs):
+    _, together, alone = runs
+    assert [row["kind"] for row in together] == [row["kind"] for row in alone]
+    for ours, theirs in zip(together, alone, strict=True):
+        assert ours.keys() == theirs.keys()
+        for name in ours:
+            if not name.startswith("wall_") and name != "checkpoint":
+                # Products are summed in another order; actions, and so what is seen, are the same here.
+                close = dict(rtol=2e-3, atol=1e-5, err_msg=name)
+                if isinstance(ours[name], str) or ours[name] is None:
+                    assert ours[name] == theirs[name]
+                else:
+                    np.testing.assert_allclose(ours[name], theirs[name], **close)
+    assert any("loss/inverse" in row for row in together)
+
+
+def test_seeds_differ(runs):
+    first, second, _ = runs
+    losses = [[row["loss/rl"] for row in rows if "loss/rl" in row] for rows in (first, second)]
+    assert len(losses[0]) == len(losses[1]) > 2
+    assert not np.allclose(*losses)
+
+
+@pytest.mark.parametrize("error", [ConfigError("had enough"), KeyboardInterrupt()], ids=["error", "ctrl-c"])
+def test_a_seed_that_ends_early_ends_all(tmp_path, monkeypatch, error):
+    original = loop.Run.update
+
+    def update(self):
+        original(self)
+        if self.config.seed == 1 and self.updates == 3:
+            raise error
+
+    monkeypatch.setattr(loop.Run, "update", update)
+    outs = [tmp_path / "a", tmp_path / "b"]
+    for out in outs:
+        out.mkdir()
+    config = Config(**{**CONFIG, "mode": "rl_only", "objectives": (), "srl_every": 1})
+    run = lambda: train_seeds(config, [0, 1], outs, progress=False)  # noqa: E731
+    if isinstance(error, ConfigError):
+        with pytest.raises(ConfigError, match="had enough"):
+            run()
+        return
+    assert [result.interrupted for result in run()] == [True, True]
+    manifests = [checkpoint.read_manifest(out) for out in outs]
+    assert [m.updates for m in manifests] == [3, 3]  # saved, all the same
