@@ -1,6 +1,9 @@
 # Every target sets up what it needs. PYTHON= chooses the interpreter, ARGS= adds to a command.
 
 VENV := .venv
+BENCH_VENV := .venv-bench
+BENCH_PYTHON ?= python3.11
+BENCH_CONSTRAINTS := experiments/benchmarks/constraints.txt
 
 # Without PYTHON=: what a finished .venv was made with, else the first interpreter that will do.
 ifndef PYTHON
@@ -13,10 +16,10 @@ VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2
 STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 
 .DEFAULT_GOAL := help
-.PHONY: help install test train lint
+.PHONY: help install test train lint bench bench-gpu bench-install
 
 help: ## list the targets
-	@sed -n 's/^\([a-z]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 10
+	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
 	@echo 'PYTHON=python3.12 chooses the interpreter (3.11 to 3.13); ARGS="..." is added to the command,'
 	@echo 'as in: make train ARGS="--seed=1"   make test ARGS="tests/replay_test.py"'
 
@@ -43,3 +46,26 @@ train: install ## train on Pong for about five minutes (two cores), into a new d
 
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .
+
+bench: install ## time this project beside PyTorch and Tianshou, and print a table (ten minutes)
+	@$(VENV)/bin/python -m experiments.benchmarks.bench $(ARGS)
+
+bench-gpu: install ## time updates, seeds and a whole run on an accelerator (needs the extra cuda12 or cuda13)
+	@$(VENV)/bin/python -m experiments.benchmarks.gpu $(ARGS)
+
+bench-install: $(BENCH_VENV)/.installed ## make .venv-bench with PyTorch and Tianshou, which bench compares with (1.6 GB)
+
+# The extra alone, without jax and whatever else this project needs. On Linux a package index may give PyTorch
+# with its GPU libraries, several GB: PIP_INDEX_URL or PIP_FIND_LINKS can point pip at a CPU build.
+$(BENCH_VENV)/.installed: pyproject.toml $(BENCH_CONSTRAINTS)
+	@if ! $(BENCH_VENV)/bin/python -c 'import pip, sys; sys.exit(sys.version_info[:2] != (3, 11))' \
+	2>/dev/null; then \
+		$(BENCH_PYTHON) -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null \
+		|| { echo '$(BENCH_PYTHON) is not Python 3.11; choose one with BENCH_PYTHON=' >&2; exit 1; }; \
+		echo 'Making $(BENCH_VENV)'; $(BENCH_PYTHON) -m venv --clear $(BENCH_VENV); fi
+	@echo 'Installing PyTorch and Tianshou into $(BENCH_VENV) (a few minutes the first time)'
+	@$(BENCH_VENV)/bin/python -c 'import tomllib; print(*tomllib.load(open("pyproject.toml", "rb"))["project"] \
+		["optional-dependencies"]["bench"], sep="\n")' > $(BENCH_VENV)/requirements.txt
+	@$(BENCH_VENV)/bin/python -m pip install --quiet --disable-pip-version-check \
+		-c $(BENCH_CONSTRAINTS) -r $(BENCH_VENV)/requirements.txt
+	@touch $@

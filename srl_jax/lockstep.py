@@ -80,7 +80,7 @@ class Together:
     """
 
     def __init__(self, function: Callable[[list[tuple]], Any], number: int):
-        self._function = function
+        self.call = function
         self._arguments: list[tuple] = [()] * number
         self._barrier = threading.Barrier(number, self._call)
 
@@ -104,7 +104,7 @@ class Together:
 
     def _call(self) -> None:
         arguments, self._arguments = self._arguments, [()] * len(self._arguments)
-        self._results = self._function(arguments)
+        self._results = self.call(arguments)
 
 
 class Share:
@@ -127,32 +127,30 @@ class Lockstep:
 
     Attributes:
         agents: by seed; each to be used by one loop, in threads of its own. States are `Share`s.
+        together: their calls, by the name that they have in an agent.
     """
 
     def __init__(self, agent: Agent, number: int):
         self._number = number
-        self._calls: list[Together] = []
-        shares = {
-            "init": self._together(self._init(agent)),
-            "update": self._together(self._update(agent.update)),
-            "update_rl": self._together(self._update(agent.update_rl)) if agent.update_rl else None,
-            "follow": self._together(self._follow(agent)),
-            "act": self._together(self._act(agent)),
-            "agree": self._together(lambda arguments: [all(a for (a,) in arguments)] * number),
+        functions = {
+            "init": self._init(agent),
+            "update": self._update(agent.update),
+            "follow": self._follow(agent),
+            "act": self._act(agent),
+            "agree": lambda arguments: [all(a for (a,) in arguments)] * number,
         }
+        if agent.update_rl:
+            functions["update_rl"] = self._update(agent.update_rl)
+        self.together = {name: Together(function, number) for name, function in functions.items()}
         self.agents = [
-            agent._replace(fetch=_fetch, **{name: c.member(i) if c else None for name, c in shares.items()})
+            agent._replace(fetch=_fetch, **{name: c.member(i) for name, c in self.together.items()})
             for i in range(number)
         ]
 
     def leave(self) -> None:
         """Ends all calls, so that no loop waits for one that has failed or was interrupted."""
-        for call in self._calls:
-            call.leave()
-
-    def _together(self, function: Callable) -> Together:
-        self._calls.append(Together(function, self._number))
-        return self._calls[-1]
+        for together in self.together.values():
+            together.leave()
 
     def _parts(self, stacked: Any) -> list[Share]:
         return [Share(stacked, i) for i in range(self._number)]

@@ -20,6 +20,55 @@ def transposed(x, kernel, bias, stride, size):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
+@pytest.mark.parametrize(
+    ("kernel", "stride", "height"),
+    [
+        (3, 1, 7),
+        (4, 2, 8),
+        (8, 4, 84 // 4),  # 21 pixels, of which the last is not seen
+        (3, 2, 9),  # a kernel that is no multiple of its stride
+        (3, 2, 10),
+        (6, 4, 14),
+        (3, 3, 9),  # no word of 2 or 4 bytes fits a row of 3
+        (2, 3, 8),  # a kernel smaller than its stride
+        (8, 8, 16),
+    ],
+)
+def test_conv_is_the_plain_convolution_in_values_and_gradients(kernel, stride, height, dtype):
+    rng = np.random.default_rng(0)
+    x = rng.integers(0, 256, (2, height, height, 3)).astype(dtype)
+    layer = Conv(5, kernel, stride, gain=0.5)
+    params = {
+        "kernel": rng.normal(size=(kernel, kernel, 3, 5)).astype(np.float32),
+        "bias": rng.normal(size=5).astype(np.float32),
+    }
+    side = (height - kernel) // stride + 1
+    cotangent = rng.normal(size=(2, side, side, 5)).astype(np.float32)
+
+    def plain(params, x):
+        return params["bias"] + jax.lax.conv_general_dilated(
+            0.5 * x, params["kernel"], (stride, stride), "VALID",
+            dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest",
+        )  # fmt: skip
+
+    @jit
+    def both(params, x):
+        def of(f):
+            if dtype == np.uint8:
+                y, pull = jax.vjp(lambda p: f(p, x), params)
+            else:
+                y, pull = jax.vjp(f, params, x)
+            return y, pull(cotangent)
+
+        ours = of(lambda p, x: layer.apply({"params": p}, x))
+        return ours, of(lambda p, x: plain(p, x.astype(jnp.float32)))
+
+    ours, theirs = both(params, x)
+    assert ours[0].shape == cotangent.shape
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-2), ours, theirs)
+
+
 @pytest.mark.parametrize(
     ("kernel", "stride", "height", "size"),
     [
@@ -146,6 +195,37 @@ def test_noisy_dense_by_hand():
     np.testing.assert_allclose(y[:, 0], [1.1 + 3.2, 1.7 + 3.2, 11 + 1.7 + 3.2], rtol=1e-6)
     # Without noise the means.
     np.testing.assert_allclose(apply(x, None)[:, 0], [4, 5, 15], rtol=1e-6)
+
+
+def test_noisy_dense_is_the_same_for_few_and_for_many_rows():
+    # Two forms of one sum: few rows are multiplied by mu and by sigma, many by their noisy sum.
+    rng = np.random.default_rng(0)
+    few, many = (rng.normal(size=(n, 30)).astype(np.float32) for n in (layers.FEW_ROWS, layers.FEW_ROWS + 1))
+    many[:-1] = few
+    f = rng.normal(size=50).astype(np.float32)
+    layer = NoisyDense(20, 2.0)
+    params = layer.init(jax.random.key(0), few, None)["params"]
+
+    @jit
+    def run(x, cotangent):
+        y, pull = jax.vjp(lambda p, x: layer.apply({"params": p}, x, f), params, x)
+        return y, pull(cotangent)
+
+    cotangent = rng.normal(size=(len(many), 20)).astype(np.float32)
+    cotangent[-1] = 0
+    (y, (grads, dx)), (z, (other_grads, dz)) = run(few, cotangent[:-1]), run(many, cotangent)
+    close = dict(rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(y, z[:-1], **close)
+    np.testing.assert_allclose(dx, dz[:-1], **close)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, **close), grads, other_grads)
+
+
+def test_factorised_noise_by_definition():
+    key = jax.random.key(2)
+    e = np.asarray(jax.random.normal(key, (1000,)))
+    f = np.asarray(jit(layers.factorised_noise, static_argnums=1)(key, 1000))
+    np.testing.assert_allclose(f, np.sign(e) * np.sqrt(np.abs(e)), rtol=1e-5)
+    assert jit(layers.factorised_noise, static_argnums=1)(key, 0).shape == (0,)
 
 
 def test_noisy_dense_noise_is_one_outer_product_in_the_size_of_its_sigmas():

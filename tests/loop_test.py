@@ -1,6 +1,7 @@
 """The loop: schedules, files and reproducibility of whole short runs on Catch."""
 
 import json
+import time
 from types import SimpleNamespace
 
 import numpy as np
@@ -57,6 +58,73 @@ def test_same_seed_same_metrics(joint, tmp_path):
     assert rows(path) != rows(tmp_path / "other")
     first, second = (checkpoint.read_manifest(p).files for p in (path, tmp_path / "again"))
     assert first == second  # the same sha256: parameters are bit-identical
+
+
+def test_timing_changes_nothing(joint, tmp_path, monkeypatch):
+    path, _ = joint
+    rng, act_and_step, update = np.random.default_rng(0), loop.act_and_step, loop.Run.update
+
+    def slow_step(*arguments):
+        time.sleep(rng.choice([0, 0.02]))
+        result = act_and_step(*arguments)
+        time.sleep(rng.choice([0, 0.02]))
+        return result
+
+    def slow_update(run):
+        time.sleep(rng.choice([0, 0.02]))
+        update(run)
+
+    monkeypatch.setattr(loop, "act_and_step", slow_step)
+    monkeypatch.setattr(loop.Run, "update", slow_update)
+    train(tmp_path / "again", **JOINT, seed=3)
+    ours, theirs = (checkpoint.read_manifest(p).files for p in (tmp_path / "again", path))
+    assert ours == theirs  # the same sha256
+    rows = [[strip_wall(r) for r in read_metrics(p / "metrics.jsonl")] for p in (tmp_path / "again", path)]
+    assert rows[0] == rows[1]
+
+
+def test_representation_losses_in_every_third_update(tmp_path, monkeypatch):
+    calls = []
+    make_agent = loop.make_agent
+
+    def watched(*arguments):
+        agent = make_agent(*arguments)
+
+        def watch(name):
+            def call(state, window, hyper):
+                result = getattr(agent, name)(state, window, hyper)
+                calls.append((name, result[2]))
+                return result
+
+            return call
+
+        return agent._replace(update=watch("update"), update_rl=watch("update_rl"))
+
+    monkeypatch.setattr(loop, "make_agent", watched)
+    train(tmp_path / "run", **JOINT, srl_every=3)
+    names = [name for name, _ in calls]
+    assert names == (["update", "update_rl", "update_rl"] * 9)[: len(names)] and len(names) == 25
+    rows = [r for r in read_metrics(tmp_path / "run" / "metrics.jsonl") if r["kind"] == "train"]
+    # Of the updates 10 to 14 (200 - 40 env steps at 1 in 8 are 20 updates; rows are 5 apart), only 12 has them.
+    assert [row["updates"] for row in rows[2:5]] == [10, 15, 20]
+    np.testing.assert_allclose(rows[3]["loss/reconstruction"], calls[12][1]["loss/reconstruction"], rtol=1e-6)
+    of_rl = [float(metrics["loss/rl"]) for _, metrics in calls[10:15]]
+    np.testing.assert_allclose(rows[3]["loss/rl"], np.mean(of_rl), rtol=1e-5)
+
+
+def test_a_step_acts_with_the_parameters_from_before_its_updates():
+    run = loop.Run(Config(**{**SMALL, "updates_per_step": 0.5}), None, False)
+    acted = []
+    act = run.agent.act
+    run.agent = run.agent._replace(
+        act=lambda state, *rest: acted.append(int(state.step)) or act(state, *rest)
+    )
+    run.start()
+    for _ in range(14):
+        run.step()
+    run.env_thread.shutdown()
+    # Two updates a step of four environments, from the step on that starts at 40.
+    assert acted == [0] * 11 + [2, 4, 6] and run.updates == 8
 
 
 def test_rows_of_a_run(joint):

@@ -10,7 +10,18 @@ from srl_jax.augment import random_shift
 from srl_jax.modes import MODES
 from srl_jax.optim import RL, make_optimizer
 from srl_jax.types import Encoder, Objective
-from srl_jax.update import Hyper, make_act, make_init, make_latents, make_update, named_key, periodic, shift
+from srl_jax.update import (
+    Hyper,
+    follow_every,
+    make_act,
+    make_follow,
+    make_init,
+    make_latents,
+    make_update,
+    named_key,
+    periodic,
+    shift,
+)
 from srl_jax.window import observation
 from tests.helpers import all_moved, identical, jit, make_window, to_numpy
 
@@ -110,6 +121,59 @@ def test_noise_differs_between_updates_and_seeds():
             state, _, metrics = update(state, SMALL, hyper)
             noises.append(np.asarray(metrics[f"{RL}/noise"]).tobytes())
     assert len(set(noises)) == 6
+
+
+def test_an_update_of_some_objectives_leaves_the_others_alone():
+    terms = {name: make_peek(slow=periodic(2) if name == RL else None) for name in (RL, "peek")}
+    optimizer = make_optimizer(terms)
+    init = make_init(PIXELS, terms, MODES["joint"], optimizer)
+    hyper = Hyper(dict.fromkeys(terms, np.float32(1)), RATES)
+    update = {
+        only: jit(make_update(PIXELS, terms, MODES["joint"], optimizer, only=only)) for only in (None, (RL,))
+    }
+    start = init(jax.random.key(0))
+    one, td_error, metrics = update[(RL,)](start, SMALL, hyper)
+    assert "loss/peek" not in metrics and f"loss/{RL}" in metrics
+    assert identical(one.params["heads"]["peek"], start.params["heads"]["peek"])
+    assert identical(one.opt_state["heads"]["peek"], start.opt_state["heads"]["peek"])
+    for tree in (lambda s: s.params["heads"][RL], lambda s: s.params["encoder"]):
+        assert all_moved(tree(one), tree(start))
+    # RL sees the same noise and moves its head alike, whether others are computed or not.
+    both, _, _ = update[None](start, SMALL, hyper)
+    np.testing.assert_allclose(one.params["heads"][RL]["w"], both.params["heads"][RL]["w"], rtol=1e-6)
+    assert not identical(one.opt_state["encoder"], both.opt_state["encoder"])
+    # In decoupled, the encoder is trained by what is left out, and so rests; Adam counts no step for it.
+    rests = jit(make_update(PIXELS, terms, MODES["decoupled"], optimizer, only=(RL,)))
+    after, _, _ = rests(start, SMALL, hyper)
+    assert identical(after.params["encoder"], start.params["encoder"])
+    assert identical(after.opt_state["encoder"], start.opt_state["encoder"])
+
+
+def test_slow_copies_may_follow_apart_from_the_update():
+    every_update = lambda new, old, step: jax.tree.map(lambda n, o: 0.9 * o + 0.1 * n, new, old)  # noqa: E731
+    cases = [
+        ({RL: periodic(3)}, 3),
+        ({RL: periodic(4), "a": periodic(6)}, 2),
+        ({"a": every_update}, 1),
+        ({}, 0),
+    ]
+    for rules, expected in cases:
+        assert follow_every({name: make_peek(slow=rule) for name, rule in rules.items()}) == expected
+    for rules in ({RL: periodic(2)}, {RL: periodic(2), "peek": every_update}):
+        terms = {name: make_peek(slow=rules.get(name)) for name in (RL, "peek")}
+        optimizer, hyper = make_optimizer(terms), Hyper(dict.fromkeys(terms, np.float32(1)), RATES)
+        state = make_init(PIXELS, terms, MODES["joint"], optimizer)(jax.random.key(0))
+        within, apart = (
+            jit(make_update(PIXELS, terms, MODES["joint"], optimizer, slow_follows=follows))
+            for follows in (True, False)
+        )
+        follow, ours, theirs = jit(make_follow(terms)), state, state
+        for i in range(1, 5):
+            ours, *_ = within(ours, SMALL, hyper)
+            theirs, *_ = apart(theirs, SMALL, hyper)
+            if i % follow_every(terms) == 0:
+                theirs = follow(theirs)
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6), ours.slow, theirs.slow)
 
 
 @pytest.mark.parametrize("target_encoder", ["slow", "online"])
