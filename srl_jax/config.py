@@ -212,7 +212,9 @@ class Config:
 
     def save(self, run: str | Path) -> None:
         """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told."""
-        told = {name: os.environ[name] for name in ("XLA_FLAGS", "JAX_PLATFORMS") if name in os.environ}
+        told = {
+            name: os.environ[name] for name in ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS") if name in os.environ
+        }
         about = {"versions": versions(), "git_revision": git_revision(), "environment": told}
         text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)
         (Path(run) / "config.json").write_text(text + "\n", encoding="utf-8")

@@ -1,5 +1,6 @@
 """Full games, unclipped scores."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -31,7 +32,8 @@ def evaluate(
     stack: int = 4,
     max_steps: int = 27_000,
     record: bool = False,
-) -> Evaluation:
+    stop: Callable[[], bool] = lambda: False,
+) -> Evaluation | None:
     """Plays full games: a lost life ends nothing, rewards are the game's own.
 
     Each environment plays its share, game i in environment i mod N, so that short games are not favoured.
@@ -45,6 +47,7 @@ def evaluate(
         stack: frames in an observation.
         max_steps: env steps after which a game is cut, its score counted as it stands.
         record: keep the first game's frames.
+        stop: asked before every step; once it says so, the games are left and there is no result.
     """
     number = env.num_envs
     shape = env.single_observation_space.shape
@@ -57,6 +60,8 @@ def evaluate(
     recorded = [frames[0]] if record else []
     step = 0
     while any(len(done) < wanted for done, wanted in zip(scores, share, strict=True)):
+        if stop():
+            return None
         frames, rewards, terminated, truncated, _ = env.step(policy(stacks.observations(), step, epsilon))
         step += 1
         score += rewards

@@ -2,10 +2,13 @@
 
 Apart from `checkpoint`, this is the only file that moves data between numpy and the device. The environments
 have a thread of their own, which acts and steps while the main thread has the device update. Both work on the
-parameters and the replay of the step before, and meet before the next one, so that no result depends on
-timing.
+parameters and the replay of the step before, and meet before the next one; an evaluation has a thread, too, and
+is awaited before the next row is written. So no result depends on timing.
 """
 
+import os
+import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +23,7 @@ from srl_jax import checkpoint, envs
 from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
-from srl_jax.evaluate import evaluate
+from srl_jax.evaluate import Evaluation, evaluate
 from srl_jax.metrics import MetricsWriter
 from srl_jax.progress import Progress
 from srl_jax.replay import Replay
@@ -73,6 +76,15 @@ def _policy(act: Callable, params_or_state: Any, key: jax.Array) -> Policy:
     return policy
 
 
+def yield_to_others() -> None:
+    """Lowers the priority of this thread and of those that it will start, where threads have one (Linux).
+
+    On a CPU the environments then take what an update leaves of it, rather than hold up its threads.
+    """
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)
+
+
 def act_and_step(policy: Policy, observations: np.ndarray, step: int, epsilon: float, env) -> tuple:
     """One step of all environments: actions int32 [N], and what `env.step` returned."""
     actions = policy(observations, step, epsilon)
@@ -119,7 +131,11 @@ class Run:
 
     def __init__(self, config: Config, out: Path, progress: bool, agent: Agent | None = None):
         self.config, self.out = config, out
-        self.env = self.make_env("train", config.num_envs)
+        # One thread for the training environments and one for evaluation. They are made there, so that the
+        # threads that they start yield to the device's, too.
+        self.env_thread = ThreadPoolExecutor(1, "environments", yield_to_others)
+        self.eval_thread = ThreadPoolExecutor(1, "evaluation", yield_to_others)
+        self.env = self.env_thread.submit(self.make_env, "train", config.num_envs).result()
         self.num_actions = int(self.env.single_action_space.n)
         self.agent = agent or make_agent(config, self.num_actions)
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
@@ -141,7 +157,8 @@ class Run:
         self.act_key = named_key(self.key, "act")
         self.eval_key = named_key(self.key, "eval")
         self.eval_env = None
-        self.env_thread = ThreadPoolExecutor(1, "environments")
+        self.evaluating: tuple | None = None  # a future, and the env steps and updates of the policy
+        self.stopped = False  # says to the evaluation that nobody waits for it
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
         self.env_steps = self.updates = 0
@@ -161,12 +178,15 @@ class Run:
             MetricsWriter(self.out / "metrics.jsonl", events) as self.writer,
             self.progress,
             self.env_thread,
+            self.eval_thread,
         ):
             try:
                 self.run()
             except (KeyboardInterrupt, BrokenBarrierError):  # the latter where another seed was the first
                 interrupted = True
                 self.progress.note(f"interrupted after {self.env_steps} env steps; saving")
+            finally:
+                self.stopped = True
             self.save()
             pictures = self.pictures()
             self.env.close()
@@ -178,18 +198,21 @@ class Run:
         """From the first reset to the last env step, or to the return that ends the run."""
         config = self.config
         self.start()
-        if self.evaluates(0):
-            return
+        self.start_evaluation()
         while self.env_steps < config.steps:
             before = self.env_steps
             self.step()
-            if self.passed(before, config.log_every):
-                self.write_train_row()
-            if self.passed(before, config.eval_every) and self.evaluates(self.env_steps):
+            rows = self.passed(before, config.log_every), self.passed(before, config.eval_every)
+            if any(rows) and self.finish_evaluation():
                 return
+            if rows[0]:
+                self.write_train_row()
+            if rows[1]:
+                self.start_evaluation()
             if self.passed(before, config.checkpoint_every or config.eval_every):
                 self.save()
             self.progress.update(self.env_steps)
+        self.finish_evaluation()
 
     def start(self) -> None:
         """Resets the training environments."""
@@ -317,36 +340,55 @@ class Run:
         self.last_row = (now, self.env_steps)
         self.log, self.returns = [], []
 
-    def evaluates(self, env_steps: int) -> bool:
-        """Evaluates and writes an "eval" row, where the mode has a policy; whether the run may stop now."""
+    def start_evaluation(self) -> None:
+        """Has the policy of now evaluated, in a thread, while training goes on; where the mode has one."""
         config = self.config
         if not self.agent.mode.rl:
+            return
+        policy = greedy_policy(self.agent, self.state.params, self.eval_key)
+        seed = seed_for(config.seed, "eval", self.env_steps)
+
+        def play() -> tuple[Evaluation | None, float]:
+            began = time.perf_counter()
+            if self.eval_env is None:
+                self.eval_env = self.make_env("eval", min(config.num_envs, config.eval_games))
+            played = evaluate(
+                policy,
+                self.eval_env,
+                games=config.eval_games,
+                seed=seed,
+                epsilon=config.eps_eval,
+                stack=config.frame_stack,
+                max_steps=config.eval_max_steps,
+                stop=lambda: self.stopped,
+            )
+            return played, time.perf_counter() - began
+
+        self.evaluating = self.eval_thread.submit(play), self.env_steps, self.updates
+
+    def finish_evaluation(self) -> bool:
+        """Waits for the evaluation that is under way, writes its row; whether its return ends the run.
+
+        Called before the next row is written, so that rows are in the same order however long games take.
+        """
+        if self.evaluating is None:
             return False
-        if self.eval_env is None:
-            self.eval_env = self.make_env("eval", min(config.num_envs, config.eval_games))
-        began = time.perf_counter()
-        played = evaluate(
-            greedy_policy(self.agent, self.state.params, self.eval_key),
-            self.eval_env,
-            games=config.eval_games,
-            seed=seed_for(config.seed, "eval", env_steps),
-            epsilon=config.eps_eval,
-            stack=config.frame_stack,
-            max_steps=config.eval_max_steps,
-        )
+        (future, env_steps, updates), self.evaluating = self.evaluating, None
+        played, seconds = future.result()
         self.evaluation = float(np.mean(played.returns))
         values = {
             "eval/return_mean": self.evaluation,
             "eval/returns": played.returns,
             "eval/lengths": played.lengths,
-            "wall_eval_s": round(time.perf_counter() - began, 3),
+            "wall_eval_s": round(seconds, 3),
         }
-        self.writer.write("eval", env_steps, self.updates, time.perf_counter() - self.started, values)
+        self.writer.write("eval", env_steps, updates, time.perf_counter() - self.started, values)
         self.progress.note(
             f"evaluation after {env_steps} env steps: mean return {self.evaluation:.2f} "
-            f"over {len(played.returns)} games, {values['wall_eval_s']:.1f} s"
+            f"over {len(played.returns)} games, {seconds:.1f} s"
         )
-        self.progress.update(env_steps, evaluation=self.evaluation)
+        self.progress.update(self.env_steps, evaluation=self.evaluation)
+        config = self.config
         solved = config.stop_at_return is not None and self.evaluation >= config.stop_at_return
         return self.agent.agree(solved)
 

@@ -196,7 +196,8 @@ class Replay:
 
         Args:
             batch_size: B.
-            beta: exponent of the importance weights (N_sampleable * p_i / sum p) ** -beta.
+            beta: exponent of the importance weights (N_sampleable * p_i / sum p) ** -beta, divided by the
+                batch's largest.
 
         Returns:
             The Window, of arrays that nothing else refers to, and int64 [B] indices, one a row, for
@@ -208,10 +209,11 @@ class Replay:
         if batch_size < 1 or not self.num_sampleable:
             raise ValueError(f"cannot draw {batch_size} of {self.num_sampleable} transitions")
         leaves = self.tree.sample_stratified(batch_size, self.rng)
-        probability = self.tree.get(leaves) / self.tree.total
-        weight = (self.num_sampleable * probability) ** -beta
+        priority = self.tree.get(leaves)
+        # The number of transitions and the sum of priorities cancel when divided by the largest weight.
+        weight = ((priority.min() / priority) ** beta).astype(np.float32)
         streams, positions = self._locate(leaves)
-        window = self._window(streams, positions, (weight / weight.max()).astype(np.float32))
+        window = self._window(streams, positions, weight)
         return window, positions * self.num_streams + streams
 
     def sampleable(self) -> np.ndarray:
@@ -226,7 +228,7 @@ class Replay:
             ValueError: an index can no longer be sampled.
         """
         indices = np.asarray(indices, np.int64)
-        if not self._is_sampleable(indices).all():
+        if not self._find(indices)[1].all():
             raise ValueError("an index is not sampleable (any more)")
         positions, streams = np.divmod(indices, self.num_streams)
         return self._window(streams, positions, np.ones(len(indices), np.float32))
@@ -247,10 +249,11 @@ class Replay:
         td_errors = _check("td_errors", td_errors, indices.shape, np.float64)
         if not np.isfinite(td_errors).all():
             raise ValueError("td_errors must be finite")
-        keep = self._is_sampleable(indices)
-        positions, streams = np.divmod(indices[keep], self.num_streams)
-        priorities = (np.abs(td_errors[keep], dtype=np.float64) + PRIORITY_EPSILON) ** self.alpha
-        self.tree.set(self._leaf(streams, positions), priorities)
+        leaves, keep = self._find(indices)
+        priorities = (np.abs(td_errors, dtype=np.float64) + PRIORITY_EPSILON) ** self.alpha
+        if not keep.all():
+            leaves, priorities = leaves[keep], priorities[keep]
+        self.tree.set(leaves, priorities)
         self.max_priority = float(priorities.max(initial=self.max_priority))
 
     def _flat(self, array):
@@ -266,10 +269,13 @@ class Replay:
         newest = self.next_position[streams] - 1
         return streams, newest - (newest - slot) % self.slots
 
-    def _is_sampleable(self, indices):
+    def _find(self, indices):
+        """The leaves of indices, and whether they can be sampled."""
         positions, streams = np.divmod(indices, self.num_streams)
         leaves = self._leaf(streams, positions)
-        return (self._locate(leaves)[1] == positions) & (self.tree.get(leaves) > 0)
+        # Not overwritten: no newer position has that slot.
+        newest = self.next_position.take(streams) - 1
+        return leaves, (positions > newest - self.slots) & (positions <= newest) & (self.tree.get(leaves) > 0)
 
     def _store(self, streams, frames):
         """Stores the next observations: frame and age."""
@@ -305,20 +311,23 @@ class Replay:
         """The Window of sampleable positions: see types.Window."""
         base = (streams * self.slots)[:, None]
         steps = base + (positions[:, None] + self._steps) % self.slots
-        flags = self._flat(self.flags).take(steps)
-        valid = np.ones(steps.shape, bool)
-        # Slots after the end hold other episodes: a step counts only if no step before it ended.
-        np.logical_and.accumulate((flags[:, :-1] & _ENDED) == 0, axis=1, out=valid[:, 1:])
-        goes_on = valid & ((flags & _TERMINAL) == 0)
-        first = positions - self._flat(self.age).take(steps[:, 0])
-        last = positions + np.add.reduce(valid, axis=1)
+        actions, rewards = self._flat(self.actions).take(steps), self._flat(self.rewards).take(steps)
         times = positions[:, None] + self._window_offsets
-        times = np.minimum(np.maximum(times, first[:, None]), last[:, None])
-        return Window(
-            frames=self._flat(self.frames).take(base + times % self.slots, axis=0),
-            actions=np.where(valid, self._flat(self.actions).take(steps), np.int32(0)),
-            rewards=np.where(valid, self._flat(self.rewards).take(steps), np.float32(0)),
-            discounts=np.where(goes_on, np.float32(self.gamma), np.float32(0)),
-            valid=valid.astype(np.float32),
-            weight=weight,
-        )
+        age = self._flat(self.age).take(steps[:, 0])
+        if age.min(initial=self.stack) < self.stack - 1:
+            times = np.maximum(times, (positions - age)[:, None])
+        flags = self._flat(self.flags).take(steps)
+        if flags.any():
+            valid = np.ones(steps.shape, bool)
+            # Slots after the end hold other episodes: a step counts only if no step before it ended.
+            np.logical_and.accumulate((flags[:, :-1] & _ENDED) == 0, axis=1, out=valid[:, 1:])
+            goes_on = valid & ((flags & _TERMINAL) == 0)
+            times = np.minimum(times, (positions + np.add.reduce(valid, axis=1))[:, None])
+            actions, rewards = np.where(valid, actions, np.int32(0)), np.where(valid, rewards, np.float32(0))
+            discounts = np.where(goes_on, np.float32(self.gamma), np.float32(0))
+            valid = valid.astype(np.float32)
+        else:
+            discounts = np.full(steps.shape, self.gamma, np.float32)
+            valid = np.ones(steps.shape, np.float32)
+        frames = self._flat(self.frames).take(base + times % self.slots, axis=0)
+        return Window(frames, actions, rewards, discounts, valid, weight)

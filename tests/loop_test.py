@@ -105,7 +105,7 @@ def test_representation_losses_in_every_third_update(tmp_path, monkeypatch):
     names = [name for name, _ in calls]
     assert names == (["update", "update_rl", "update_rl"] * 9)[: len(names)] and len(names) == 25
     rows = [r for r in read_metrics(tmp_path / "run" / "metrics.jsonl") if r["kind"] == "train"]
-    # Of the updates 10 to 14 (200 - 40 env steps at 1 in 8 are 20 updates; rows are 5 apart), only 12 has them.
+    # A row is five updates apart from the next; of the updates 10 to 14, only 12 has them.
     assert [row["updates"] for row in rows[2:5]] == [10, 15, 20]
     np.testing.assert_allclose(rows[3]["loss/reconstruction"], calls[12][1]["loss/reconstruction"], rtol=1e-6)
     of_rl = [float(metrics["loss/rl"]) for _, metrics in calls[10:15]]
@@ -231,8 +231,10 @@ def test_ctrl_c_saves_and_says_so(tmp_path, monkeypatch):
 
 def test_early_stop(tmp_path):
     result = train(tmp_path / "run", stop_at_return=-1.0)
-    assert result.env_steps == 0  # every return is at least -1
-    assert checkpoint.read_manifest(tmp_path / "run").env_steps == 0
+    # Every return is at least -1, the untrained policy's too; it is known before the first row is written.
+    assert result.env_steps == 40
+    assert checkpoint.read_manifest(tmp_path / "run").env_steps == 40
+    assert [row["kind"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl")] == ["eval"]
 
 
 def test_updates_are_compiled_once(joint):

@@ -21,8 +21,8 @@ JAX_CACHE = {
 }
 
 
-def _wanted(env, encoder="sac_ae:features=256", **given):
-    defaults = {"glibc": True, "gpu": False, "cache": CACHE, "works": lambda flags: True}
+def _wanted(env, encoder="nature", **given):
+    defaults = {"glibc": True, "gpu": False, "cache": CACHE, "cores": 2, "works": lambda flags: True}
     return runtime.wanted(env, encoder, **(defaults | given))
 
 
@@ -32,7 +32,10 @@ def _never(flags):
 
 def test_the_wanted_environment():
     everything = runtime.MALLOC | JAX_CACHE | {"XLA_FLAGS": YNN}
-    assert _wanted({}) == _wanted({}, "nature") == everything
+    assert _wanted({}) == everything
+    assert _wanted({}, "sac_ae:features=256") == everything | {"NPROC": "3"}
+    assert _wanted({"NPROC": "1"}, "sac_ae") == everything
+    assert _wanted({}, "sac_ae", gpu=True) == JAX_CACHE
     assert _wanted(everything, works=_never) == {}
     assert _wanted({}, "tiny", works=_never) == runtime.MALLOC | JAX_CACHE
     assert _wanted({}, glibc=False) == JAX_CACHE | {"XLA_FLAGS": YNN}

@@ -90,12 +90,16 @@ def whole_run(seconds: float) -> dict[str, float]:
             run.step()
         rate = (run.env_steps - first) / (time.perf_counter() - start)
         with MetricsWriter(Path("/dev/null"), None) as run.writer:
-            run.evaluates(run.env_steps)  # compiles
-            start = time.perf_counter()
-            run.evaluates(run.env_steps)
-            evaluation = time.perf_counter() - start
+            seconds = []
+            for _ in range(2):  # the first compiles
+                start = time.perf_counter()
+                run.start_evaluation()
+                run.finish_evaluation()
+                seconds.append(time.perf_counter() - start)
+            evaluation = seconds[1]
     finally:
         run.env_thread.shutdown()
+        run.eval_thread.shutdown()
         run.env.close()
     evaluations = config.steps // config.eval_every + 1
     minutes = (config.steps / rate + evaluations * evaluation) / 60
