@@ -19,16 +19,20 @@ from srl_jax.update import Hyper, follow_every, make_act, make_follow, make_init
 def _donating_the_optimizers_state(update: Callable) -> Callable:
     """The jitted update, (state, window, hyper) -> ...; of its state all but `opt_state` outlives the call.
 
-    XLA overwrites donated parameters before their last use, and so copies them first.
+    XLA overwrites donated parameters before their last use, and so copies them first. What an update does not
+    change, slow copies and key, is left out of its results, which would be copies as well.
     """
 
     @partial(jax.jit, donate_argnums=1)
     def donating(state, opt_state, window, hyper):
-        return update(state._replace(opt_state=opt_state), window, hyper)
+        new, td_error, metrics = update(state._replace(opt_state=opt_state), window, hyper)
+        return new._replace(slow=None, key=None), td_error, metrics
 
     @wraps(update)
     def call(state, window, hyper):
-        return donating(state._replace(opt_state=None), state.opt_state, window, hyper)
+        rest = state._replace(opt_state=None)
+        new, td_error, metrics = donating(rest, state.opt_state, window, hyper)
+        return new._replace(slow=state.slow, key=state.key), td_error, metrics
 
     call.jitted = donating
     return call

@@ -165,16 +165,18 @@ class Lockstep:
 
         def stacked(state: TrainState, opt_state: Any, windows: list, hyper: Any):
             window = jax.tree.map(lambda *x: jnp.stack(x), *windows)  # on the device: the host copies nothing
-            return several(state._replace(opt_state=opt_state), window, hyper)
+            state, td_error, metrics = several(state._replace(opt_state=opt_state), window, hyper)
+            return state._replace(slow=None, key=None), td_error, metrics
 
         stacked = jax.jit(stacked, donate_argnums=1)
 
         def function(arguments: list[tuple]) -> list[tuple]:
             (share, _, hyper), *_ = arguments
-            state = share.stacked
+            old = share.stacked
             state, td_error, metrics = stacked(
-                state._replace(opt_state=None), state.opt_state, [window for _, window, _ in arguments], hyper
+                old._replace(opt_state=None), old.opt_state, [window for _, window, _ in arguments], hyper
             )
+            state = state._replace(slow=old.slow, key=old.key)
             rows = [None] * self._number if td_error is None else np.asarray(td_error)
             return list(zip(self._parts(state), rows, self._parts(metrics), strict=True))
 
