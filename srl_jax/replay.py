@@ -24,7 +24,7 @@ PRIORITY_EPSILON = 1e-6
 def _check(name, array, shape, dtype):
     """The array, if it has this shape and its numbers all fit this dtype."""
     array = np.asarray(array)
-    if array.shape != shape or not np.can_cast(array.dtype, dtype):
+    if array.shape != shape or not (array.dtype == dtype or np.can_cast(array.dtype, dtype)):
         expected = f"{np.dtype(dtype)} {shape}"
         raise ValueError(f"{name} must be {expected}, got {array.dtype} {array.shape}")
     return array
@@ -253,7 +253,7 @@ class Replay:
         priorities = (np.abs(td_errors, dtype=np.float64) + PRIORITY_EPSILON) ** self.alpha
         if not keep.all():
             leaves, priorities = leaves[keep], priorities[keep]
-        self.tree.set(leaves, priorities)
+        self.tree.put(leaves, priorities)
         self.max_priority = float(priorities.max(initial=self.max_priority))
 
     def _flat(self, array):
@@ -292,20 +292,23 @@ class Replay:
         Where it is its episode's last one (ended, bool [M]), every slot of the episode among those
         `steps_back`, int [J], is complete, else only the one `horizon` steps back.
         """
-        newest = self.next_position[streams] - 1
-        positions = newest[:, None] - steps_back
-        opens = ended[:, None] | (steps_back == self.horizon)
-        opens &= positions >= self.episode_start[streams, None]
-        leaves_opened = self._leaf(streams[:, None], positions)[opens]
+        newest = self.next_position.take(streams) - 1
+        if ended.any():
+            positions = newest[:, None] - steps_back
+            opens = ended[:, None] | (steps_back == self.horizon)
+            opens &= positions >= self.episode_start[streams, None]
+            leaves_opened = self._leaf(streams[:, None], positions)[opens]
+        else:
+            positions = newest - self.horizon
+            leaves_opened = self._leaf(streams, positions)[positions >= self.episode_start.take(streams)]
         # Slots from newest - slots + 1 on are intact; the first stack - 1 of them may lack frames.
         oldest = newest - self.slots + self.stack - 1
-        closes = oldest >= 0
-        leaves_closed = self._leaf(streams[closes], oldest[closes])
+        leaves_closed = self._leaf(streams, oldest)[oldest >= 0]
         num_closed = int(np.count_nonzero(self.tree.get(leaves_closed)))
         self.num_sampleable += len(leaves_opened) - num_closed
         values = np.zeros(len(leaves_closed) + len(leaves_opened))
         values[len(leaves_closed) :] = self.max_priority
-        self.tree.set(np.concatenate((leaves_closed, leaves_opened)), values)
+        self.tree.put(np.concatenate((leaves_closed, leaves_opened)), values)
 
     def _window(self, streams, positions, weight):
         """The Window of sampleable positions: see types.Window."""

@@ -97,7 +97,8 @@ class Objective(NamedTuple):
             arrays for `td_error`).
         weight: the factor of its batch mean in the summed loss.
         horizon: how many steps after s_t it reads.
-        slow: how its head's slow copy follows, (new, old, step) -> slow; None if it has none.
+        slow: how its head's slow copy follows, (new, old, step) -> slow; None if it has none. A rule that
+            changes nothing but in every k-th step may say so by an attribute `every` = k.
         is_decoder: the head is a decoder, which the optimizer's decoder weight decay applies to.
         image: None, or (head, latents, window) -> (target, output), float32 [B, H, W, S] each, for the
             picture that shows what it learnt.
