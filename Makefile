@@ -40,7 +40,7 @@ $(STAMP): pyproject.toml constraints.txt
 test: install ## run all tests
 	@$(VENV)/bin/python -m pytest -q $(ARGS)
 
-train: install ## train on Pong for about five minutes (two cores), into a new directory under runs/
+train: install ## train on Pong for about three minutes (two cores), into a new directory under runs/
 	@$(VENV)/bin/python -m experiments.train --preset=demo \
 		--out=runs/demo-$$(date +%Y%m%d-%H%M%S) $(ARGS)
 

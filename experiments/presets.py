@@ -78,7 +78,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "thesis/joint_forward_256_aug": {**_256, **_JOINT_FORWARD, **_AUG},
     # Figure A.1, pretrained and still updated by both losses.
     "thesis/joint_from_pretrained_256": {**_256, **_JOINT},
-    # What `make train` runs: a look at the whole in about five minutes on two cores.
+    # What `make train` runs: a look at the whole in about three minutes on two cores.
     "demo": {
         **_JOINT,
         "game": "Pong",
