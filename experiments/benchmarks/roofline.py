@@ -22,50 +22,26 @@ PASSES = 7
 
 
 class Cost(NamedTuple):
-    """Of one update: operations (two for a multiplication and an addition), and the parameters' bytes moved."""
+    """Of one update: operations (a multiplication and an addition are two), and bytes of parameters moved."""
 
     operations: float
     nbytes: float
 
 
 def update_cost(preset: str) -> Cost:
-    """Counts a preset's update.
-
-    Each layer is applied forward to s_t and s_{t+n} by the online network and to s_{t+n} by the slow one, and
-    backward to s_t, which costs two forward passes (one for the first layer, whose input needs no gradient).
-    """
+    """Counts a preset's update: XLA's count of operations before it optimises, and passes over parameters."""
     import jax
 
-    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of
+    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, random_window
     from srl_jax.agent import make_agent
 
     config = config_of(preset)
     agent = make_agent(config, NUM_ACTIONS)
-    shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
-    batch, side, operations, first = config.batch_size, config.frame_size, 0.0, True
-    for name, layer in shapes["encoder"].items():
-        if name.startswith("Conv"):
-            kernel, _, channels, features = layer["kernel"].shape
-            stride = {("nature", 8): 4, ("nature", 4): 2, ("sac_ae", 3): 2 if first else 1}.get(
-                (config.encoder.split(":")[0], kernel), 1
-            )
-            side = (side - kernel) // stride + 1
-            forward = 2 * side**2 * kernel**2 * channels * features
-            operations += batch * forward * (3 + (1 if first else 2))
-            first = False
-        elif name.startswith("Dense"):
-            operations += batch * 2 * np.prod(layer["kernel"].shape) * 5
-    for name, layer in shapes["heads"]["rl"].items():
-        operations += batch * 2 * np.prod(layer["kernel"].shape) * 5 if "kernel" in layer else 0
-    if "reconstruction" in shapes["heads"]:  # the mirror of the encoder, forward and backward once
-        side, sizes = config.frame_size, []
-        for i, stride in enumerate((2, 1, 1, 1)):
-            side = (side - 3) // stride + 1
-            sizes.append((side, 4 if i == 0 else 32))
-        operations += batch * 3 * sum(2 * s**2 * 9 * 32 * features for s, features in sizes)
-        operations += batch * 3 * 2 * np.prod(shapes["heads"]["reconstruction"]["Dense_0"]["kernel"].shape)
-    trained = 4 * sum(int(np.prod(x.shape)) for x in jax.tree.leaves(shapes))
-    slow = 4 * sum(int(np.prod(x.shape)) for x in jax.tree.leaves((shapes["encoder"], shapes["heads"]["rl"])))
+    state = jax.eval_shape(agent.init, jax.random.key(0))
+    window = random_window(config, agent.horizon, 0)
+    arguments = (state._replace(opt_state=None), state.opt_state, window, agent.hyper)
+    operations = agent.update.jitted.lower(*arguments).cost_analysis()["flops"]
+    trained, slow = (4 * sum(x.size for x in jax.tree.leaves(tree)) for tree in (state.params, state.slow))
     return Cost(float(operations), float(PASSES * trained + slow))
 
 
