@@ -100,6 +100,11 @@ def has_gpu(env: Mapping[str, str], device: str = "/dev/nvidia0") -> bool:
     return os.path.exists(device) and plugin and first in ("", "cuda", "gpu")
 
 
+def cores() -> int:
+    """How many this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
 def machine() -> str:
     """A name for the kind of processor, of its architecture, model and instruction sets as far as known."""
     found = [platform.machine()]
@@ -239,7 +244,7 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
         glibc=has_glibc(),
         gpu=has_gpu(env),
         cache=cache,
-        cores=len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1,
+        cores=cores(),
         works=lambda flags: remembered(flags, folder),
     )
     hint = "(--tune_runtime=off leaves the environment alone)"

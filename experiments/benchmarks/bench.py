@@ -20,6 +20,7 @@ from typing import Any
 from absl import flags
 
 from experiments import flags as config_flags
+from experiments import runtime
 from experiments.benchmarks import table
 from experiments.benchmarks.rows import CHECK_UPDATES, ROWS, SIDES, Side, series_of, sides_of
 from experiments.benchmarks.runner import TOLERANCE, CheckFailed, Results, measure
@@ -122,11 +123,6 @@ def cpu_model() -> str:
         return platform.processor() or platform.machine()
 
 
-def cores() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def load() -> float:
     """How many programs have been running for the last minute, NaN where the system does not tell."""
     try:
@@ -189,7 +185,7 @@ def bench(values: flags.FlagValues) -> None:
     about = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "cpu": cpu_model(),
-        "cores": cores(),
+        "cores": runtime.cores(),
         "load": load(),
         "git_revision": git_revision(),
         "versions": versions(),
@@ -204,7 +200,7 @@ def bench(values: flags.FlagValues) -> None:
         sides,
         rounds=rounds,
         start=lambda side: start(side, python),
-        threads=cores(),
+        threads=runtime.cores(),
     )
     text, record = report(rows, skipped, results, about)
     print(text, end="")
