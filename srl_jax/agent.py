@@ -1,7 +1,7 @@
 """From a configuration to the functions that it means: encoder, objectives, update, act."""
 
-from collections.abc import Callable
-from functools import partial, wraps
+from collections.abc import Callable, Collection
+from functools import wraps
 from typing import NamedTuple
 
 import jax
@@ -12,30 +12,69 @@ from srl_jax.config import Config
 from srl_jax.modes import MODES, Mode, encoder_learning_rate
 from srl_jax.optim import RL, make_optimizer
 from srl_jax.rl import Algorithm
-from srl_jax.types import Context, Encoder, Objective
-from srl_jax.update import Hyper, follow_every, make_act, make_follow, make_init, make_update, periodic
+from srl_jax.types import Context, Encoder, Objective, TrainState, Window
+from srl_jax.update import (
+    Hyper,
+    Moving,
+    follow_every,
+    make_act,
+    make_follow,
+    make_init,
+    make_update,
+    periodic,
+    put_together,
+    take_apart,
+)
 
 
-def _donating_the_optimizers_state(update: Callable) -> Callable:
-    """The jitted update, (state, window, hyper) -> ...; of its state all but `opt_state` outlives the call.
+class JittedUpdate:
+    """A jitted update, (state, window, hyper) -> (state, td_error, metrics).
 
-    XLA overwrites donated parameters before their last use, and so copies them first. What an update does not
-    change, slow copies and key, is left out of its results, which would be copies as well.
+    It takes over the buffers of the optimizer's state of the groups that move, and no others. What it does
+    not change is no result of the compiled function: XLA would copy it.
+
+    Args:
+        update: from `make_update`.
+        mode: its mode.
+        active: the names of the objectives that it computes.
+        lift: of the pure function (opt_state, moving, still, window, hyper) -> (Moving, td_error, metrics),
+            to another one that is jitted in its place: see `srl_jax.lockstep`.
+
+    Attributes:
+        pure: `update`.
+        compiled: the jitted function, of such arguments.
     """
 
-    @partial(jax.jit, donate_argnums=1)
-    def donating(state, opt_state, window, hyper):
-        new, td_error, metrics = update(state._replace(opt_state=opt_state), window, hyper)
-        return new._replace(slow=None, key=None), td_error, metrics
+    def __init__(
+        self,
+        update: Callable,
+        mode: Mode,
+        active: Collection[str],
+        lift: Callable[[Callable], Callable] = lambda change: change,
+    ):
+        self.pure = update
+        self._mode, self._active = mode, active
 
-    @wraps(update)
-    def call(state, window, hyper):
-        rest = state._replace(opt_state=None)
-        new, td_error, metrics = donating(rest, state.opt_state, window, hyper)
-        return new._replace(slow=state.slow, key=state.key), td_error, metrics
+        def change(opt_state, moving: Moving, still: TrainState, window: Window, hyper: Hyper):
+            state = put_together(moving._replace(opt_state=opt_state), still)
+            new, td_error, metrics = update(state, window, hyper)
+            return take_apart(new, mode, active)[0], td_error, metrics
 
-    call.jitted = donating
-    return call
+        self.compiled = jax.jit(lift(change), donate_argnums=0)
+
+    def __call__(self, state: TrainState, window: Window, hyper: Hyper):
+        arguments = self.arguments(state, window, hyper)
+        moving, td_error, metrics = self.compiled(*arguments)
+        return put_together(moving, arguments[2]), td_error, metrics
+
+    def arguments(self, state: TrainState, window: Window, hyper: Hyper) -> tuple:
+        """Of `compiled`, from an update's."""
+        moving, still = take_apart(state, self._mode, self._active)
+        return moving.opt_state, moving._replace(opt_state=None), still, window, hyper
+
+    def lifted(self, lift: Callable[[Callable], Callable]) -> "JittedUpdate":
+        """The same update, lifted."""
+        return JittedUpdate(self.pure, self._mode, self._active, lift)
 
 
 class Agent(NamedTuple):
@@ -65,8 +104,8 @@ class Agent(NamedTuple):
     objectives: dict[str, Objective]
     horizon: int
     init: Callable
-    update: Callable
-    update_rl: Callable | None
+    update: JittedUpdate
+    update_rl: JittedUpdate | None
     follow: Callable
     follow_every: int
     act: Callable
@@ -111,19 +150,18 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         "representation": config.lr_srl,
     }
 
-    def jitted_update(only=None):
-        return _donating_the_optimizers_state(
-            make_update(
-                encoder,
-                terms,
-                mode,
-                optimizer,
-                augment=config.augment,
-                target_encoder=config.target_encoder,
-                only=only,
-                slow_follows=False,
-            )
+    def jitted_update(only: Collection[str]) -> JittedUpdate:
+        update = make_update(
+            encoder,
+            terms,
+            mode,
+            optimizer,
+            augment=config.augment,
+            target_encoder=config.target_encoder,
+            only=only,
+            slow_follows=False,
         )
+        return JittedUpdate(update, mode, only)
 
     def jitted_act(noisy: bool):
         act = make_act(encoder, algorithm.q_values, noisy=noisy)
@@ -140,7 +178,7 @@ def make_agent(config: Config, num_actions: int) -> Agent:
             make_init(encoder, terms, mode, optimizer, target_encoder=config.target_encoder),
             compiler_options={"xla_backend_optimization_level": 0},  # it runs once: compile it fast
         ),
-        update=jitted_update(),
+        update=jitted_update(terms.keys()),
         update_rl=jitted_update({RL}) if config.srl_every > 1 else None,
         follow=jax.jit(make_follow(terms)),
         follow_every=follow_every(terms),

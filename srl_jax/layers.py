@@ -6,10 +6,12 @@ slower than the same layer written as a pad and a VALID convolution.
 """
 
 import math
+from functools import partial
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 
 from srl_jax.types import Array
 
@@ -75,6 +77,25 @@ class Dense(nn.Module):
         return x @ kernel + bias
 
 
+class WideDense(nn.Module):
+    """`Dense` for far more outputs than inputs; its kernel is [features, inputs], as PyTorch keeps it.
+
+    The product that gives the inputs' gradient then runs along the rows of a kernel that may have 10M
+    numbers. The bias is added as a product with ones, whose gradient is one, too: as a sum over the batch
+    it takes YNNPACK 7 ms with two threads for 32 x 39,200 numbers, and 0.1 ms as a product.
+    """
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        inputs = x.shape[-1]
+        init = uniform_fan_in(inputs)
+        kernel = self.param("kernel", init, (self.features, inputs))
+        bias = self.param("bias", init, (self.features,))
+        return x @ kernel.T + jnp.ones((x.shape[0], 1)) @ bias[None, :]
+
+
 class Conv(nn.Module):
     """A VALID convolution, float32 [B, H, W, C] -> [B, H', W', features]; `he_normal`, biases 0.
 
@@ -137,8 +158,7 @@ class ConvTranspose(nn.Module):
         kernel = jnp.pad(kernel, [(0, taps * s - k)] * 2 + [(0, 0)] * 2)
         kernel = kernel.reshape(taps, s, taps, s, channels, self.features)[::-1, :, ::-1]
         kernel = kernel.transpose(0, 2, 4, 1, 3, 5).reshape(taps, taps, channels, -1)
-        x = jnp.pad(x, [(0, 0)] + [(taps - 1, taps - 1)] * 2 + [(0, 0)])
-        x = _valid_conv(x, kernel, 1)
+        x = _full_conv(x, kernel)
         batch, rows = x.shape[:2]
         x = x.reshape(batch, rows, rows, s, s, self.features).transpose(0, 1, 3, 2, 4, 5)
         x = x.reshape(batch, rows * s, rows * s, self.features)
@@ -209,10 +229,43 @@ def _valid_conv(x: Array, kernel: Array, stride: int) -> Array:
         kernel = kernel.reshape(taps, stride, taps, stride, channels, -1)
         kernel = kernel.transpose((0, 2, 4, 1, 3, 5) if of_bytes else (0, 2, 1, 3, 4, 5))
         kernel = kernel.reshape(taps, taps, stride * stride * channels, -1)
-    x = x.astype(jnp.float32)
+    return _conv(x.astype(jnp.float32), kernel)
+
+
+def _conv(x: Array, kernel: Array, padding: int = 0) -> Array:
+    """A convolution of stride 1 of [B, H, W, C] with [k, k, C, features], zeros around the image."""
     return jax.lax.conv_general_dilated(
-        x, kernel, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        x, kernel, (1, 1), [(padding, padding)] * 2, dimension_numbers=("NHWC", "HWIO", "NHWC")
     )
+
+
+def _padded(x: Array, kernel: Array) -> Array:
+    """The image with as many zeros around it as let every tap of the kernel see its every pixel."""
+    return jnp.pad(x, [(0, 0)] + [(len(kernel) - 1, len(kernel) - 1)] * 2 + [(0, 0)])
+
+
+@jax.custom_jvp
+def _full_conv(x: Array, kernel: Array) -> Array:
+    """The convolution of `_padded`.
+
+    The padding is explicit where the kernel is differentiated, as XLA wants it. It is the convolution's own
+    where the image is, whose gradient would otherwise be computed for the zeros as well: 24 % more of it
+    for 35 x 35 pixels and a kernel of 3 x 3.
+    """
+    return _conv(_padded(x, kernel), kernel)
+
+
+@partial(_full_conv.defjvp, symbolic_zeros=True)
+def _full_conv_jvp(primals, tangents):
+    (x, kernel), (x_dot, kernel_dot) = primals, tangents
+    padded = _padded(x, kernel)
+    y = _conv(padded, kernel)
+    y_dot = jnp.zeros_like(y)
+    if not isinstance(x_dot, SymbolicZero):
+        y_dot += _conv(x_dot, kernel, len(kernel) - 1)
+    if not isinstance(kernel_dot, SymbolicZero):
+        y_dot += _conv(padded, kernel_dot)
+    return y, y_dot
 
 
 def _pad_to(x: Array, size: int) -> Array:

@@ -19,10 +19,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.agent import Agent, make_agent
+from srl_jax.agent import Agent, JittedUpdate, make_agent
 from srl_jax.config import Config
 from srl_jax.loop import Result, Run, make_env
-from srl_jax.types import Params, TrainState
+from srl_jax.types import Params
 
 
 def train_seeds(
@@ -160,23 +160,22 @@ class Lockstep:
         # One after the other, so that each seed starts as it would alone, to the bit.
         return lambda arguments: self._parts(stack([agent.init(*a) for a in arguments]))
 
-    def _update(self, update: Callable) -> Callable:
-        several = jax.vmap(update.__wrapped__, in_axes=(0, 0, None))
+    def _update(self, update: JittedUpdate) -> Callable:
+        def lift(change: Callable) -> Callable:
+            several = jax.vmap(change, in_axes=(0, 0, 0, 0, None))
 
-        def stacked(state: TrainState, opt_state: Any, windows: list, hyper: Any):
-            window = jax.tree.map(lambda *x: jnp.stack(x), *windows)  # on the device: the host copies nothing
-            state, td_error, metrics = several(state._replace(opt_state=opt_state), window, hyper)
-            return state._replace(slow=None, key=None), td_error, metrics
+            def stacked(opt_state, moving, still, windows: list, hyper):
+                window = jax.tree.map(lambda *x: jnp.stack(x), *windows)  # on the device, not on the host
+                return several(opt_state, moving, still, window, hyper)
 
-        stacked = jax.jit(stacked, donate_argnums=1)
+            return stacked
+
+        together = update.lifted(lift)
 
         def function(arguments: list[tuple]) -> list[tuple]:
             (share, _, hyper), *_ = arguments
-            old = share.stacked
-            state, td_error, metrics = stacked(
-                old._replace(opt_state=None), old.opt_state, [window for _, window, _ in arguments], hyper
-            )
-            state = state._replace(slow=old.slow, key=old.key)
+            windows = [window for _, window, _ in arguments]
+            state, td_error, metrics = together(share.stacked, windows, hyper)
             rows = [None] * self._number if td_error is None else np.asarray(td_error)
             return list(zip(self._parts(state), rows, self._parts(metrics), strict=True))
 

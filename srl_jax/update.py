@@ -98,20 +98,51 @@ def make_init(
     return init
 
 
-def split(params: Params, mode: Mode, active: Collection[str]) -> tuple[Params, Params]:
-    """The groups that move where these objectives run in this mode, and those that do not; see `join`."""
+def split(groups: Params, mode: Mode, active: Collection[str]) -> tuple[Params, Params]:
+    """The groups that move where these objectives run in this mode, and those that do not; see `join`.
+
+    Args:
+        groups: {"encoder": tree, "heads": {name: tree}}: parameters, or an optimizer's state.
+    """
     moves = mode.rl_trains_encoder and RL in active
     moves |= mode.representation_trains_encoder and any(name != RL for name in active)
     trainable, still = {"heads": {}}, {"heads": {}}
-    (trainable if moves else still)["encoder"] = params["encoder"]
-    for name, head in params["heads"].items():
+    if "encoder" in groups:
+        (trainable if moves else still)["encoder"] = groups["encoder"]
+    for name, head in groups["heads"].items():
         (trainable if name in active else still)["heads"][name] = head
     return trainable, still
 
 
 def join(trainable: Params, still: Params) -> Params:
-    """The params that `split` took apart."""
+    """The groups that `split` took apart."""
     return {**trainable, **still, "heads": {**trainable["heads"], **still["heads"]}}
+
+
+class Moving(NamedTuple):
+    """What an update changes of a `TrainState`: of the groups that move, and the number of updates.
+
+    jax gives the buffers of donated arguments to the results of their shape, in the results' order. With the
+    optimizer's state first, moments are written over the old moments, and not parameters.
+    """
+
+    opt_state: Params
+    params: Params
+    step: Array
+
+
+def take_apart(state: TrainState, mode: Mode, active: Collection[str]) -> tuple[Moving, TrainState]:
+    """What an update of these objectives changes of a state, and the rest; see `put_together`."""
+    opt_state, still_opt_state = split(state.opt_state, mode, active)
+    params, still_params = split(state.params, mode, active)
+    still = state._replace(opt_state=still_opt_state, params=still_params, step=None)
+    return Moving(opt_state, params, state.step), still
+
+
+def put_together(moving: Moving, still: TrainState) -> TrainState:
+    """The state that `take_apart` took apart."""
+    opt_state = join(moving.opt_state, still.opt_state)
+    return still._replace(opt_state=opt_state, params=join(moving.params, still.params), step=moving.step)
 
 
 def make_update(

@@ -254,7 +254,7 @@ def test_updates_are_compiled_once(joint):
         run.update()
         run.env_steps += 40  # another learning rate
     assert isinstance(run.replay.sample(2, 0.5)[0], Window)
-    assert run.agent.update.jitted._cache_size() == 1
+    assert run.agent.update.compiled._cache_size() == 1
 
 
 def test_config_is_data(joint):

@@ -39,7 +39,7 @@ def build(mode):
         lr_srl=2e-3,
     )
     agent = make_agent(config, NUM_ACTIONS)
-    return agent, jit(agent.update.__wrapped__), random_state(agent.init)
+    return agent, jit(agent.update.pure), random_state(agent.init)
 
 
 def groups(params):

@@ -39,8 +39,8 @@ def update_cost(preset: str) -> Cost:
     agent = make_agent(config, NUM_ACTIONS)
     state = jax.eval_shape(agent.init, jax.random.key(0))
     window = random_window(config, agent.horizon, 0)
-    arguments = (state._replace(opt_state=None), state.opt_state, window, agent.hyper)
-    operations = agent.update.jitted.lower(*arguments).cost_analysis()["flops"]
+    arguments = agent.update.arguments(state, window, agent.hyper)
+    operations = agent.update.compiled.lower(*arguments).cost_analysis()["flops"]
     trained, slow = (4 * sum(x.size for x in jax.tree.leaves(tree)) for tree in (state.params, state.slow))
     return Cost(float(operations), float(PASSES * trained + slow))
 

@@ -333,8 +333,8 @@ def _load(network: Network, params: dict[str, np.ndarray], prefix: str) -> None:
 def _load_decoder(decoder: Decoder, params: dict[str, np.ndarray]) -> None:
     """As `_load`, a decoder."""
     name = "params/heads/reconstruction"
-    _set(decoder.linear.weight, _rows_chw(params.pop(f"{name}/Dense_0/kernel").T, decoder.maps))
-    _set(decoder.linear.bias, _rows_chw(params.pop(f"{name}/Dense_0/bias"), decoder.maps))
+    _set(decoder.linear.weight, _rows_chw(params.pop(f"{name}/WideDense_0/kernel"), decoder.maps))
+    _set(decoder.linear.bias, _rows_chw(params.pop(f"{name}/WideDense_0/bias"), decoder.maps))
     for i, conv in enumerate(decoder.convs):
         _load_conv(conv, params, f"{name}/ConvTranspose_{i}", (2, 3, 0, 1))
 

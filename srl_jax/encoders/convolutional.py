@@ -6,7 +6,7 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 
-from srl_jax.layers import Conv, ConvTranspose, Dense
+from srl_jax.layers import Conv, ConvTranspose, Dense, WideDense
 from srl_jax.types import Array, Decoder, Encoder
 
 LEAST_SEEN = 0.95
@@ -85,7 +85,7 @@ class DecoderNetwork(nn.Module):
     def __call__(self, x: Array) -> Array:
         side, maps = self.sizes[-1], self.layers[-1].channels
         if self.bottleneck:
-            x = nn.relu(Dense(side * side * maps)(x)).reshape(-1, side, side, maps)
+            x = nn.relu(WideDense(side * side * maps)(x)).reshape(-1, side, side, maps)
         else:
             extra = x[:, None, None, self.latent :]
             x = x[:, : self.latent].reshape(-1, side, side, maps)
