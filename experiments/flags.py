@@ -5,8 +5,10 @@ Flags are defined here, for the entry points, and nowhere else in the library. I
 
 import difflib
 import logging
+import os
 import sys
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from typing import Any, NoReturn
 
 from absl import app, flags
@@ -153,6 +155,34 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
     else:
         modes.check(config, complete=complete)
     return config
+
+
+def check_place(flag: str, text: str) -> Path:
+    """The path of a directory that is there and can be written to, or can be made there; writes nothing.
+
+    Args:
+        flag: that it came from.
+        text: its value, with or without ~.
+
+    Raises:
+        ConfigError: neither holds.
+    """
+    path = Path(os.path.expanduser(text))
+    try:
+        if path.is_dir():
+            if not os.access(path, os.W_OK | os.X_OK):
+                raise ConfigError(f"--{flag}={text}: no permission to write there")
+            return path
+        if os.path.lexists(path):
+            raise ConfigError(f"--{flag}={text}: exists and is not a directory")
+        parent = next(p for p in path.absolute().parents if os.path.lexists(p))
+        if not parent.is_dir():
+            raise ConfigError(f"--{flag}={text}: {parent} is not a directory")
+        if not os.access(parent, os.W_OK | os.X_OK):
+            raise ConfigError(f"--{flag}={text}: no permission to write in {parent}")
+    except OSError as error:
+        raise ConfigError(f"--{flag}={text}: {error.strerror}") from None
+    return path
 
 
 def fail(message: Any) -> NoReturn:

@@ -107,20 +107,9 @@ def check_out(out: str | None, overwrite: bool, config: Config) -> Path:
     """
     if not out:
         raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
-    path = Path(os.path.expanduser(out))
+    path = config_flags.check_place("out", out)
     try:
-        if not path.is_dir():
-            if os.path.lexists(path):
-                raise ConfigError(f"--out={out}: exists and is not a directory")
-            parent = next(p for p in path.absolute().parents if os.path.lexists(p))
-            if not parent.is_dir():
-                raise ConfigError(f"--out={out}: {parent} is not a directory")
-            if not os.access(parent, os.W_OK | os.X_OK):
-                raise ConfigError(f"--out={out}: no permission to write in {parent}")
-            return path
-        if not os.access(path, os.W_OK | os.X_OK):
-            raise ConfigError(f"--out={out}: no permission to write there")
-        if not any(path.iterdir()):
+        if not path.is_dir() or not any(path.iterdir()):
             return path
         if not overwrite:
             raise ConfigError(f"--out={out}: not empty; name a new directory, or --overwrite deletes the run")

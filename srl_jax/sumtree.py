@@ -95,19 +95,24 @@ class SumTree:
         prefix_sums = np.asarray(prefix_sums, np.float64)
         if prefix_sums.size and not prefix_sums.min() >= 0:
             raise ValueError("prefix sums must not be negative")
-        return self._find(prefix_sums)
+        return self._find(prefix_sums, self._ends())
 
-    def _find(self, prefix_sums):
-        ends = np.zeros(len(self._sums) + 1)  # of the blocks; the first is where they begin
-        np.cumsum(self._sums, out=ends[1:])
+    def _ends(self):
+        """float64 [blocks + 1]: 0, and the sums up to the end of each block."""
+        ends = np.empty(len(self._sums) + 1)
+        ends[0] = 0.0
+        np.add.accumulate(self._sums, out=ends[1:])
         if not ends[-1] > 0:
             raise ValueError("the tree is empty: all its values are 0")
+        return ends
+
+    def _find(self, prefix_sums, ends):
         # Strictly below the last end, so that an end above exists; the first such end is above the one
         # before it, too, so its block is not 0. Likewise for the leaf within the block.
         rest = np.minimum(prefix_sums, np.nextafter(ends[-1], 0.0))
-        blocks = np.searchsorted(ends[1:], rest, side="right")
-        rest = rest - ends[blocks]
-        ends = np.cumsum(self._blocks.take(blocks, axis=0), axis=1)
+        blocks = ends[1:].searchsorted(rest, side="right")
+        rest = rest - ends.take(blocks)
+        ends = np.add.accumulate(self._blocks.take(blocks, axis=0), axis=1)
         rest = np.minimum(rest, np.nextafter(ends[:, -1], 0.0))
         return (blocks << _SHIFT) + (ends > rest[:, None]).argmax(axis=1)
 
@@ -126,4 +131,5 @@ class SumTree:
         Raises:
             ValueError: all leaves are 0.
         """
-        return self._find((np.arange(n) + rng.random(n)) * (self.total / n))
+        ends = self._ends()
+        return self._find((np.arange(n) + rng.random(n)) * (ends[-1] / n), ends)

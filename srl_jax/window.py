@@ -24,7 +24,12 @@ def observation(window: Window, k: int | Array) -> Array:
 
 def image(window: Window, k: int) -> Array:
     """The observation at offset k as a regression target: float32 [B, H, W, S] in [0, 1]."""
-    return observation(window, k).astype(jnp.float32) / 255.0
+    return to_unit(observation(window, k))
+
+
+def to_unit(pixels: Array) -> Array:
+    """uint8 0..255 -> float32 in [0, 1]; float32 passes as it is."""
+    return pixels.astype(jnp.float32) / 255.0 if pixels.dtype == jnp.uint8 else pixels
 
 
 def stack_last(frames: Array) -> Array:

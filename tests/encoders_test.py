@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from srl_jax import encoders
-from srl_jax.encoders.convolutional import to_unit
+from srl_jax.window import to_unit
 from tests.helpers import STACK, count, jit, random_params
 
 

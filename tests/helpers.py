@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.encoders.convolutional import to_unit
 from srl_jax.types import Context, Decoder, Encoder, TrainState, Window
+from srl_jax.window import to_unit
 
 SIZE, STACK, NUM_ACTIONS = 6, 4, 3
 """Of the frames, observations and actions that the helpers make, unless told otherwise."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from srl_jax import layers
-from srl_jax.layers import Conv, ConvTranspose, Dense, NoisyDense
+from srl_jax.layers import Conv, ConvTranspose, Dense, NoisyDense, WideDense
 from tests.helpers import jit
 
 
@@ -103,6 +103,49 @@ def test_conv_transpose_is_the_dilated_convolution_in_values_and_gradients(kerne
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), ours, theirs)
 
 
+def test_conv_transpose_in_forward_mode():
+    # Its rule is written by hand, so that either tangent alone and both together need a look.
+    layer = ConvTranspose(5, 3, 1, 7)
+    rng = np.random.default_rng(0)
+    x, x_dot = rng.normal(size=(2, 2, 5, 5, 3)).astype(np.float32)
+    kernel, kernel_dot = rng.normal(size=(2, 3, 3, 3, 5)).astype(np.float32)
+    bias = np.zeros(5, np.float32)
+
+    @jit
+    def tangents(x, x_dot, kernel, kernel_dot):
+        def of(f):
+            both = jax.jvp(f, (kernel, x), (kernel_dot, x_dot))[1]
+            of_kernel = jax.jvp(lambda k: f(k, x), (kernel,), (kernel_dot,))[1]
+            return both, of_kernel, jax.jvp(lambda x: f(kernel, x), (x,), (x_dot,))[1]
+
+        ours = of(lambda kernel, x: layer.apply({"params": {"kernel": kernel, "bias": bias}}, x))
+        return ours, of(lambda kernel, x: transposed(x, kernel, bias, 1, 7))
+
+    ours, theirs = tangents(x, x_dot, kernel, kernel_dot)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), ours, theirs)
+
+
+def test_wide_dense_is_dense_with_a_transposed_kernel_in_values_and_gradients():
+    rng = np.random.default_rng(0)
+    x, cotangent = rng.normal(size=(6, 3)).astype(np.float32), rng.normal(size=(6, 40)).astype(np.float32)
+    params = {
+        "kernel": rng.normal(size=(40, 3)).astype(np.float32),
+        "bias": rng.normal(size=40).astype(np.float32),
+    }
+
+    @jit
+    def both(params, x):
+        def of(f):
+            y, pull = jax.vjp(f, params, x)
+            return y, pull(cotangent)
+
+        plain = lambda p, x: Dense(40).apply({"params": {**p, "kernel": p["kernel"].T}}, x)  # noqa: E731
+        return of(lambda p, x: WideDense(40).apply({"params": p}, x)), of(plain)
+
+    ours, theirs = both(params, x)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5), ours, theirs)
+
+
 def test_conv_transpose_by_hand():
     # Stride 2 and a 2 x 2 kernel: each pixel is multiplied into a block of its own. Size 5 leaves a last
     # row and column that no kernel reaches. The bias, 0.5, is everywhere.
@@ -151,6 +194,7 @@ def test_every_layer_knows_its_fan_in(monkeypatch):
     monkeypatch.setattr(layers, "he_normal", record)
     cases = [
         (Dense(7), (1, 25), 25),
+        (WideDense(7), (1, 25), 25),
         (NoisyDense(7), (1, 25), 25),
         (Conv(6, 3, 1), (1, 5, 5, 4), 3 * 3 * 4),
         (ConvTranspose(6, 3, 1, 7), (1, 5, 5, 4), 3 * 3 * 4),

@@ -25,10 +25,9 @@ FRAME = 18  # the smallest that the tiny encoder takes
 WINDOW = make_window(size=FRAME)
 
 
-@functools.cache
-def build(mode):
-    """(agent, its update compiled quickly, an initial state on the host) of a small real configuration."""
-    config = Config(
+def small(mode, **values):
+    """A small real configuration."""
+    return Config(
         mode=mode,
         frame_size=FRAME,
         encoder="tiny:features=8",
@@ -37,8 +36,14 @@ def build(mode):
         slow_update_every=2,
         lr_rl=1e-3,
         lr_srl=2e-3,
+        **values,
     )
-    agent = make_agent(config, NUM_ACTIONS)
+
+
+@functools.cache
+def build(mode):
+    """(agent, its update compiled quickly, an initial state on the host) of a small configuration."""
+    agent = make_agent(small(mode), NUM_ACTIONS)
     return agent, jit(agent.update.pure), random_state(agent.init)
 
 
@@ -165,3 +170,24 @@ def test_no_td_error_without_rl():
     _, td_error, metrics = update(state, WINDOW, agent.hyper)
     assert td_error is None
     assert "inverse/accuracy" in metrics and "grad_norm/encoder" in metrics
+
+
+def test_an_update_of_rl_alone_takes_over_and_returns_only_what_it_moves():
+    agent = make_agent(small("joint", srl_every=2), NUM_ACTIONS)
+    state = jax.tree.map(jax.numpy.asarray, random_state(agent.init))
+    before = jax.tree.map(np.array, state.params)
+    new, _, _ = agent.update_rl(state, WINDOW, agent.hyper)
+    for name in TERMS:
+        for old, same in ((state.params, new.params), (state.opt_state, new.opt_state)):
+            assert all(
+                a is b
+                for a, b in zip(*map(jax.tree.leaves, (old["heads"][name], same["heads"][name])), strict=True)
+            )
+    assert new.slow is state.slow and new.key is state.key
+    assert all(
+        x.is_deleted() for x in jax.tree.leaves((state.opt_state["encoder"], state.opt_state["heads"][RL]))
+    )
+    # The old parameters may still act.
+    assert identical(state.params, before)
+    assert all_moved(before["encoder"], new.params["encoder"])
+    assert int(new.step) == 1

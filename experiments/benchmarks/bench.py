@@ -66,17 +66,9 @@ def check_out(out: str | None) -> Path | None:
     """
     if not out:
         return None
-    path = Path(out).expanduser()
-    try:
-        if path.is_dir() and any(path.iterdir()):
-            raise ConfigError(f"--out={out}: not empty; name a new directory")
-        parent = next(p for p in (path, *path.absolute().parents) if os.path.lexists(p))
-        if not parent.is_dir():
-            raise ConfigError(f"--out={out}: {parent} is not a directory")
-        if not os.access(parent, os.W_OK | os.X_OK):
-            raise ConfigError(f"--out={out}: no permission to write in {parent}")
-    except OSError as error:
-        raise ConfigError(f"--out={out}: {error.strerror}") from None
+    path = config_flags.check_place("out", out)
+    if path.is_dir() and any(path.iterdir()):
+        raise ConfigError(f"--out={out}: not empty; name a new directory")
     return path
 
 

@@ -81,10 +81,13 @@ class Loop:
 
         Returns:
             Lists of seconds: "iteration"; "acting", acting and the step of all environments, while nothing
-            is updated; "update", from sampling to setting priorities, while no environment moves.
+            is updated; "update", from sampling to setting priorities, while no environment moves. And "busy":
+            processor time of the whole iterations to their wall-clock time.
         """
         run = self._run
+        busy = time.process_time()
         iteration = [timed(run.step) for _ in range(iterations)]
+        busy = (time.process_time() - busy) / sum(iteration)
         self._acting.clear()
         run.due = lambda: 0
         for _ in range(iterations):
@@ -94,7 +97,7 @@ class Loop:
         # As many as were left out, so that none is due later.
         update = [timed(run.update) for _ in range(iterations)]
         self._forget()
-        return {"iteration": iteration, "acting": acting, "update": update}
+        return {"iteration": iteration, "acting": acting, "update": update, "busy": [busy]}
 
     def _forget(self) -> None:
         """As after a row."""

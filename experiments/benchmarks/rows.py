@@ -150,6 +150,7 @@ SERIES |= {
     "tianshou": Series("tianshou", _RUN, _rate),
     "iteration": Series("loop", _PARTS, _scaled("iteration", 1e3)),
     "slower part": Series("loop", _PARTS, _slower_part),
+    "busy": Series("loop", _PARTS, _scaled("busy", 1.0)),
     "sample": Series("replay", _SAMPLE, _scaled("sample", 1e3)),
     "gather": Series("replay", _SAMPLE, _scaled("gather", 1e3)),
     "add": Series("replay", _INSERT, _scaled("add", 1e3)),
@@ -179,6 +180,7 @@ ROWS: dict[str, Row] = {
     "overlap": Row(
         "loop / slower part", "ms", "iteration", {"acting or update alone": "slower part"}, _at_most(1.12)
     ),
+    "busy": Row("cores that the loop keeps busy", "cores", "busy", {}, ()),
     "joint_cost": Row(
         "joint / rl_only, updates of 256", "ms", "jax joint", {"rl_only": "jax 256"}, _at_most(1.7)
     ),

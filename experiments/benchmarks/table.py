@@ -75,7 +75,7 @@ def figures(ours: Series, theirs: dict[str, Series], speedup: bool, goals: Seque
         theirs: {label: the other side's}, with as many rounds; where there are several, the one with the
             least median counts, so they must be times. May be empty.
         speedup: the ratio is theirs to ours; else ours to theirs. It is formed round by round.
-        goals: all must be met.
+        goals: all must be met; may be empty.
     """
     own = medians(ours)
     found = {"ours": spread(own)}
@@ -121,8 +121,8 @@ def cells(title: str, unit: str, found: Figures, goals: Sequence[Goal]) -> list[
         spread_text(found.ours, unit),
         f"{theirs}, {found.label}" if found.label else theirs,
         spread_text(found.ratio),
-        goals_text(goals, unit),
-        "yes" if found.met else "no",
+        goals_text(goals, unit) or "-",
+        ("yes" if found.met else "no") if goals else "-",
     ]
 
 

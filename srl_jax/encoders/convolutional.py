@@ -160,10 +160,3 @@ def convolutional_encoder(
         observation_shape=(height, width, channels),
         make_decoder=make_decoder,
     )
-
-
-def to_unit(observation: Array) -> Array:
-    """uint8 0..255 -> float32 in [0, 1]; float32 passes as it is."""
-    if observation.dtype == jnp.uint8:
-        return observation.astype(jnp.float32) / 255.0
-    return observation
