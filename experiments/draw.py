@@ -13,8 +13,8 @@ from experiments import flags as config_flags
 from experiments import plots
 from srl_jax.config import Config
 from srl_jax.data import thesis_curve
+from srl_jax.errors import ConfigError
 from srl_jax.metrics import read_metrics
-from srl_jax.specs import ConfigError
 
 FLAGS = flags.FLAGS
 

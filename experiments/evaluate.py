@@ -12,7 +12,7 @@ from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
-from srl_jax.specs import ConfigError
+from srl_jax.errors import ConfigError
 
 FLAGS = flags.FLAGS
 

@@ -16,7 +16,8 @@ from absl import app, flags
 from experiments.presets import ENCODER_PRESETS, PRESETS, preset_values
 from srl_jax import modes, specs
 from srl_jax.config import INFOS, Config
-from srl_jax.specs import ConfigError, Info
+from srl_jax.errors import EXIT_STATUS, ConfigError
+from srl_jax.specs import Info
 
 # The flags count as the entry point's own, so that --help shows them.
 flags.disclaim_key_flags()
@@ -185,10 +186,10 @@ def check_place(flag: str, text: str) -> Path:
     return path
 
 
-def fail(message: Any) -> NoReturn:
-    """Prints one line on stderr and exits with status 2."""
+def fail(message: Any, status: int = 2) -> NoReturn:
+    """Prints one line on stderr and exits."""
     print("error: " + " ".join(str(message).split()), file=sys.stderr)
-    sys.exit(2)
+    sys.exit(status)
 
 
 def parse(argv: list[str], values: flags.FlagValues = flags.FLAGS) -> list[str]:
@@ -215,17 +216,17 @@ def parse(argv: list[str], values: flags.FlagValues = flags.FLAGS) -> list[str]:
 
 
 def run(main: Callable[[list[str]], Any]) -> None:
-    """Runs an entry point: parses the flags and turns bad input into one line and exit status 2.
+    """Runs an entry point: parses the flags and turns what `srl_jax.errors` has into a line and a status.
 
     Args:
-        main: takes [the program's name]; may raise ConfigError.
+        main: takes [the program's name]; may return the exit status.
     """
 
     def guarded(argv: list[str]) -> Any:
         try:
             return main(argv)
-        except ConfigError as error:
-            fail(error)
+        except tuple(EXIT_STATUS) as error:
+            fail(error, next(n for kind, n in EXIT_STATUS.items() if isinstance(error, kind)))
 
     # absl prints what libraries log, and jax logs every accelerator that it does not find.
     logging.getLogger("jax").setLevel(logging.WARNING)

@@ -1,25 +1,29 @@
 """Trains one agent: `python -m experiments.train --preset=thesis/joint_256 --out=runs/pong`.
 
-Bad input ends with one line on stderr and exit status 2 before anything is written. What can be
-checked without jax is checked before jax is imported.
+Bad input ends with one line on stderr and exit status 2 before anything is written. What can be checked
+without jax is checked before jax is imported. Ctrl-C and SIGTERM write a checkpoint and end the run.
 """
 
 import contextlib
 import dataclasses
 import functools
 import importlib.util
-import json
 import os
-import shutil
-from collections.abc import Callable
+import signal
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
+from experiments.directories import all_to_resume, check_out, run_directory
 from srl_jax.config import INFOS, Config, resolve
-from srl_jax.specs import ConfigError, build, parse
+from srl_jax.errors import ConfigError, SaveError
+from srl_jax.rundir import held
+from srl_jax.specs import build, parse
 
 FLAGS = flags.FLAGS
 
@@ -34,6 +38,13 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
         None,
         "several seeds in this process, 0,1,2, instead of --seed: for an accelerator; a run directory each "
         "in --out, seed0, seed1, ...",
+        flag_values=values,
+    )
+    flags.DEFINE_enum(
+        "resume",
+        "off",
+        ["off", "auto"],
+        "auto: go on with the run that --out holds from its newest good checkpoint, as if it had not ended",
         flag_values=values,
     )
     flags.DEFINE_boolean("overwrite", False, "delete the run that --out holds first", flag_values=values)
@@ -91,86 +102,25 @@ def check_paths(config: Config) -> None:
             raise ConfigError(f"--{flag}={path}: no such path; give a run directory or a checkpoint")
 
 
-def check_out(out: str | None, overwrite: bool, config: Config) -> Path:
-    """Whether a run directory can be made there; writes nothing.
-
-    Args:
-        out: the path, or None where it was not given.
-        overwrite: a run that lies there may be deleted.
-        config: what it starts from must not be deleted.
-
-    Returns:
-        The path.
-
-    Raises:
-        ConfigError: it cannot.
-    """
-    if not out:
-        raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
-    path = config_flags.check_place("out", out)
-    try:
-        if not path.is_dir() or not any(path.iterdir()):
-            return path
-        if not overwrite:
-            raise ConfigError(f"--out={out}: not empty; name a new directory, or --overwrite deletes the run")
-        if path.is_symlink() or not _is_run(path):
-            raise ConfigError(f"--out={out}: not a run directory, so --overwrite does not delete it")
-    except OSError as error:
-        raise ConfigError(f"--out={out}: {error.strerror}") from None
-    kept = {"encoder_from": config.encoder_from, "policy_from": config.policy_from}
-    for flag, source in kept.items():
-        if source and Path(source).resolve().is_relative_to(path.resolve()):
-            raise ConfigError(f"--out={out}: --overwrite would delete --{flag}={source}")
-    if Path.cwd().is_relative_to(path.resolve()):
-        raise ConfigError(f"--out={out}: --overwrite would delete the working directory")
-    return path
-
-
-def _is_run(path: Path) -> bool:
-    """Whether the directory holds a config.json that this program wrote."""
-    try:
-        values = json.loads((path / "config.json").read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return False
-    return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()
-
-
 @contextlib.contextmanager
-def run_directory(path: Path, config: Config):
-    """Makes the run directory with its config.json; unmakes it if what follows refuses the config.
+def stopping() -> Iterator[list[int]]:
+    """A list that gets the signal when Ctrl-C or SIGTERM comes; a second one interrupts at once."""
+    caught: list[int] = []
 
-    Args:
-        path: as `check_out` returned it; a run that lies there is deleted.
-        config: resolved; written to config.json.
+    def handle(number: int, frame: Any) -> None:
+        if caught:
+            raise KeyboardInterrupt
+        caught.append(number)
 
-    Raises:
-        ConfigError: it cannot be made.
-    """
+    if threading.current_thread() is not threading.main_thread():  # which has the signals
+        yield caught
+        return
+    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
-        if path.is_dir() and any(path.iterdir()):
-            shutil.rmtree(path)
-    except OSError as error:
-        raise ConfigError(f"--out={path}: {error.strerror}") from None
-    made = []
-    try:
-        try:
-            missing = [p for p in (path, *path.absolute().parents) if not p.exists()]
-            for directory in reversed(missing):
-                directory.mkdir()
-                made.append(directory)
-            config.save(path)
-        except OSError as error:
-            raise ConfigError(f"--out={path}: {error.strerror}") from None
-        yield
-    except ConfigError:
-        # Only what was made here goes: once anything else lies there, all of it stays.
-        with contextlib.suppress(OSError):
-            if [file.name for file in path.iterdir()] == ["config.json"]:
-                (path / "config.json").unlink()
-        with contextlib.suppress(OSError):
-            for directory in reversed(made):
-                directory.rmdir()
-        raise
+        yield caught
+    finally:
+        for number, handler in old.items():
+            signal.signal(number, handler)
 
 
 def resolved(config: Config) -> Config:
@@ -195,7 +145,7 @@ def resolved(config: Config) -> Config:
     return full
 
 
-def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = None) -> None:
+def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = None) -> int:
     """Checks the command line, makes the run directory and trains.
 
     Args:
@@ -203,50 +153,80 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         prepare: called with --tune_runtime and the encoder before jax is imported, and only where a run
             follows. It may replace the process, so only a process of our own gives it.
 
+    Returns:
+        The exit status: 0, or 128 and the signal that stopped the run.
+
     Raises:
         ConfigError: the command line is not valid; nothing was written.
+        SaveError, Diverged: see `srl_jax.loop.train`.
     """
     config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
     if values["print_config"].value:
         print(resolved(config).to_json())
-        return
+        return 0
     seeds = check_seeds(values)
-    path = check_out(values["out"].value, values["overwrite"].value, config)
+    resume = values["resume"].value == "auto"
+    path = check_out(values["out"].value, config, overwrite=values["overwrite"].value, resume=resume)
     check_extras(config)
     check_paths(config)
     if prepare is not None:
         prepare(values["tune_runtime"].value, config.encoder)
     config = resolved(config)
 
-    from experiments import plots
-    from experiments.draw import draw_run
     from srl_jax import checkpoint, loop
 
     checkpoint.check_sources(config)
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
-    with contextlib.ExitStack() as directories:
-        for directory, its_config in runs:
-            directories.enter_context(run_directory(directory, its_config))
+    manifests = all_to_resume(runs) if resume else [None] * len(runs)
+    if all(m is not None and checkpoint.NUMBERS not in m.files for m in manifests):
+        print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
+        return 0
+    with contextlib.ExitStack() as stack:
+        for (directory, its_config), manifest in zip(runs, manifests, strict=True):
+            stack.enter_context(held(directory) if manifest else run_directory(directory, its_config))
+        caught = stack.enter_context(stopping())
         if seeds:
             from srl_jax import lockstep
 
-            results = lockstep.train_seeds(config, seeds, [directory for directory, _ in runs])
+            directories = [directory for directory, _ in runs]
+            results = lockstep.train_seeds(
+                config, seeds, directories, resume=manifests, stop=lambda: bool(caught)
+            )
         else:
-            results = [loop.train(config, path)]
-    if plots.available():
-        for (directory, its_config), result in zip(runs, results, strict=True):
-            draw_run(directory, its_config, pictures=result.pictures)
-    else:
-        print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
+            results = [loop.train(config, path, resume=manifests[0], stop=lambda: bool(caught))]
+        draw([directory for directory, _ in runs], [config for _, config in runs], results)
+    if any(result.interrupted for result in results):
+        print(f"stopped after {results[0].env_steps} env steps; --resume=auto goes on from there, in {path}")
+        return 128 + (caught[0] if caught else signal.SIGINT)
     done = f"{results[0].env_steps} env steps, {results[0].updates} updates"
     print(f"{done}{' of each seed' if seeds else ''}; everything is in {path}")
+    return 0
 
 
-def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> None:
-    """The entry point; `prepare` as for `train`."""
+def draw(paths: list[Path], configs: list[Config], results: list) -> None:
+    """The figures of runs, where what they need is installed.
+
+    Raises:
+        SaveError: they cannot be written.
+    """
+    from experiments import plots
+    from experiments.draw import draw_run
+
+    if not plots.available():
+        print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
+        return
+    for path, config, result in zip(paths, configs, results, strict=True):
+        try:
+            draw_run(path, config, pictures=result.pictures)
+        except OSError as error:
+            raise SaveError(f"{path}: no figures: {error.strerror}") from error
+
+
+def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> int:
+    """The entry point; `prepare` and the status as of `train`."""
     del argv
-    train(FLAGS, prepare)
+    return train(FLAGS, prepare)
 
 
 if __name__ == "__main__":

@@ -12,6 +12,9 @@ Policy = Callable[[np.ndarray, int, float], np.ndarray]
 class FrameStack:
     """The last S frames of N environments; an episode's first frame stands in for those before it.
 
+    Attributes:
+        frames: uint8 [N, S, H, W], newest last; all the state there is.
+
     Args:
         num_envs: N.
         stack: S.
@@ -19,21 +22,21 @@ class FrameStack:
     """
 
     def __init__(self, num_envs: int, stack: int, frame_shape: tuple):
-        self._frames = np.zeros((num_envs, stack, *frame_shape), np.uint8)
+        self.frames = np.zeros((num_envs, stack, *frame_shape), np.uint8)
 
     def begin(self, frames: np.ndarray, mask: np.ndarray | None = None) -> None:
         """Starts episodes from frames uint8 [N, H, W], where mask bool [N] says so (None: everywhere)."""
         mask = np.ones(len(frames), bool) if mask is None else mask
-        self._frames[mask] = frames[mask][:, None]
+        self.frames[mask] = frames[mask][:, None]
 
     def push(self, frames: np.ndarray) -> None:
         """Adds the next frame of every environment, uint8 [N, H, W]."""
-        self._frames[:, :-1] = self._frames[:, 1:]
-        self._frames[:, -1] = frames
+        self.frames[:, :-1] = self.frames[:, 1:]
+        self.frames[:, -1] = frames
 
     def observations(self) -> np.ndarray:
         """uint8 [N, S, H, W], newest last: a fresh array, since jax may go on reading what it was handed."""
-        return self._frames.copy()
+        return self.frames.copy()
 
 
 def seed_for(seed: int, *purpose) -> int:
@@ -47,9 +50,8 @@ def linear(start: float, end: float, steps: int, now: int) -> float:
     return start + (end - start) * min(1.0, now / steps)
 
 
-def random_policy(num_actions: int, seed: int) -> Policy:
-    """The policy that draws actions uniformly; step and epsilon do not matter to it."""
-    rng = np.random.default_rng(seed)
+def random_policy(num_actions: int, rng: np.random.Generator) -> Policy:
+    """The policy that draws actions uniformly from `rng`; step and epsilon do not matter to it."""
 
     def policy(frames: np.ndarray, step: int, epsilon: float) -> np.ndarray:
         return rng.integers(0, num_actions, len(frames), dtype=np.int32)

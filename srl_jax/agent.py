@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
 from srl_jax.modes import MODES, Mode, encoder_learning_rate
-from srl_jax.optim import RL, make_optimizer
+from srl_jax.optim import RL, make_optimizer, real_copy
 from srl_jax.rl import Algorithm
 from srl_jax.types import Context, Encoder, Objective, TrainState, Window
 from srl_jax.update import (
@@ -95,6 +95,9 @@ class Agent(NamedTuple):
         act_eval: (params, frames, key, step, epsilon) -> actions, without noise.
         fetch: list of updates' metrics -> the same on the host.
         agree: (bool) -> whether all seeds of this process say so.
+        shapes: () -> the `TrainState` that `init` gives, in shapes and dtypes.
+        export: state -> this seed's `TrainState`.
+        adopt: `TrainState` of arrays on the host or the device -> a state of copies.
         hyper: the numbers of an update.
     """
 
@@ -112,6 +115,9 @@ class Agent(NamedTuple):
     act_eval: Callable
     fetch: Callable
     agree: Callable
+    shapes: Callable
+    export: Callable
+    adopt: Callable
     hyper: Hyper
 
 
@@ -168,16 +174,15 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         return jax.jit(lambda params, *rest: act(params["encoder"], params["heads"][RL], *rest))
 
     act = jitted_act(noisy=True)
+    init = make_init(encoder, terms, mode, optimizer, target_encoder=config.target_encoder)
     return Agent(
         mode=mode,
         encoder=encoder,
         algorithm=algorithm,
         objectives=terms,
         horizon=max(1, *(o.horizon for o in terms.values())),
-        init=jax.jit(
-            make_init(encoder, terms, mode, optimizer, target_encoder=config.target_encoder),
-            compiler_options={"xla_backend_optimization_level": 0},  # it runs once: compile it fast
-        ),
+        # It runs once: compile it fast.
+        init=jax.jit(init, compiler_options={"xla_backend_optimization_level": 0}),
         update=jitted_update(terms.keys()),
         update_rl=jitted_update({RL}) if config.srl_every > 1 else None,
         follow=jax.jit(make_follow(terms)),
@@ -186,6 +191,9 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         act_eval=jitted_act(noisy=False),
         fetch=jax.device_get,
         agree=lambda said: said,
+        shapes=lambda: jax.eval_shape(init, jax.random.key(0)),
+        export=lambda state: state,
+        adopt=real_copy,
         hyper=Hyper(
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},

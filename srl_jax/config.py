@@ -17,7 +17,8 @@ from typing import Any
 
 from srl_jax import modes, specs
 from srl_jax.envs import GAMES
-from srl_jax.specs import ConfigError, Info
+from srl_jax.errors import ConfigError
+from srl_jax.specs import Info
 
 _PACKAGES = (
     "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
@@ -122,6 +123,10 @@ class Config:
     checkpoint_every: int = _steps(
         0, "how often a checkpoint is written; 0: as often as evaluation", minimum=0
     )
+    keep_encoder_every: int = _value(
+        int, 0, "the encoder of every so manyth checkpoint is kept in encoders/; 0: none", "checkpoints",
+        minimum=0,
+    )  # fmt: skip
     tensorboard: bool = _value(bool, False, "also write TensorBoard events")
 
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
@@ -212,10 +217,7 @@ class Config:
 
     def save(self, run: str | Path) -> None:
         """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told."""
-        told = {
-            name: os.environ[name] for name in ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS") if name in os.environ
-        }
-        about = {"versions": versions(), "git_revision": git_revision(), "environment": told}
+        about = {"versions": versions(), "git_revision": git_revision(), "environment": told_to_xla()}
         text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)
         (Path(run) / "config.json").write_text(text + "\n", encoding="utf-8")
 
@@ -253,6 +255,17 @@ def resolve(
         lr_encoder=modes.encoder_learning_rate(config),
         checkpoint_every=config.checkpoint_every or config.eval_every,
     )
+
+
+def difference(there: Config, here: Config) -> str:
+    """What differs between two configurations, `steps is 1000 there and 2000 here, ...`; "" if nothing."""
+    pairs = ((name, getattr(there, name), getattr(here, name)) for name in INFOS)
+    return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
+
+
+def told_to_xla() -> dict[str, str]:
+    """The environment variables that change an update's roundings."""
+    return {name: os.environ[name] for name in ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS") if name in os.environ}
 
 
 def versions() -> dict[str, str]:

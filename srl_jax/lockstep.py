@@ -20,27 +20,36 @@ import jax.numpy as jnp
 import numpy as np
 
 from srl_jax.agent import Agent, JittedUpdate, make_agent
+from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config
 from srl_jax.loop import Result, Run, make_env
 from srl_jax.types import Params
 
 
 def train_seeds(
-    config: Config, seeds: Sequence[int], outs: Sequence[str | Path], *, progress: bool = True
+    config: Config,
+    seeds: Sequence[int],
+    outs: Sequence[str | Path],
+    *,
+    progress: bool = True,
+    resume: Sequence[Manifest | None] | None = None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> list[Result]:
     """Trains agents of several seeds in this process, in step.
 
     Each has replay, environments, and a run directory as from `train`. Only the first shows its progress. A
-    return that ends a run early must be reached by all in one evaluation. Ctrl-C ends all, and all are saved.
+    return that ends a run early must be reached by all in one evaluation. What stops one stops all.
 
     Args:
         config: of the runs, resolved; its seed does not matter.
         seeds: distinct.
         outs: their run directories.
         progress: whether the first draws a progress bar on stderr.
+        resume: a checkpoint of each to go on from, all of the same env step; None to begin.
+        stop: see `srl_jax.loop.train`.
 
     Raises:
-        srl_jax.specs.ConfigError: a spec or a checkpoint to start from does not fit.
+        srl_jax.errors.ConfigError: a spec or a checkpoint to start from does not fit.
     """
     number = len(seeds)
     configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
@@ -51,7 +60,9 @@ def train_seeds(
     def one(i: int) -> Result:
         finished = False
         try:
-            result = Run(configs[i], Path(outs[i]), progress and i == 0, lockstep.agents[i]).train()
+            shown, manifest = progress and i == 0, resume[i] if resume else None
+            run = Run(configs[i], Path(outs[i]), shown, lockstep.agents[i], resume=manifest, stop=stop)
+            result = run.train()
             finished = not result.interrupted
             return result
         finally:
@@ -120,6 +131,7 @@ class Share:
 
 
 _slice = jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree))
+_stack = jax.jit(lambda trees: jax.tree.map(lambda *x: jnp.stack(x), *trees))
 
 
 class Lockstep:
@@ -137,13 +149,18 @@ class Lockstep:
             "update": self._update(agent.update),
             "follow": self._follow(agent),
             "act": self._act(agent),
+            "adopt": self._adopt(),
             "agree": lambda arguments: [all(a for (a,) in arguments)] * number,
         }
         if agent.update_rl:
             functions["update_rl"] = self._update(agent.update_rl)
         self.together = {name: Together(function, number) for name, function in functions.items()}
         self.agents = [
-            agent._replace(fetch=_fetch, **{name: c.member(i) for name, c in self.together.items()})
+            agent._replace(
+                fetch=_fetch,
+                export=lambda share: _slice(share.stacked, share.seed),
+                **{name: c.member(i) for name, c in self.together.items()},
+            )
             for i in range(number)
         ]
 
@@ -156,9 +173,11 @@ class Lockstep:
         return [Share(stacked, i) for i in range(self._number)]
 
     def _init(self, agent: Agent) -> Callable:
-        stack = jax.jit(lambda states: jax.tree.map(lambda *x: jnp.stack(x), *states))
         # One after the other, so that each seed starts as it would alone, to the bit.
-        return lambda arguments: self._parts(stack([agent.init(*a) for a in arguments]))
+        return lambda arguments: self._parts(_stack([agent.init(*a) for a in arguments]))
+
+    def _adopt(self) -> Callable:
+        return lambda arguments: self._parts(_stack([state for (state,) in arguments]))
 
     def _update(self, update: JittedUpdate) -> Callable:
         def lift(change: Callable) -> Callable:

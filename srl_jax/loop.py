@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import BrokenBarrierError
 from typing import Any, NamedTuple
@@ -19,15 +19,15 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax import checkpoint, envs
+from srl_jax import checkpoint, envs, snapshot
 from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
+from srl_jax.errors import Diverged
 from srl_jax.evaluate import Evaluation, evaluate
-from srl_jax.metrics import MetricsWriter
-from srl_jax.progress import Progress
 from srl_jax.replay import Replay
-from srl_jax.types import Window
+from srl_jax.reporting import Report
+from srl_jax.types import Params, Window
 from srl_jax.update import Hyper, make_latents, named_key
 
 PICTURES = 6
@@ -39,7 +39,7 @@ class Result(NamedTuple):
 
     Attributes:
         env_steps, updates: done.
-        interrupted: whether Ctrl-C ended it; all files are in order all the same.
+        interrupted: whether it was stopped before its end; its checkpoint is of that moment.
         pictures: {objective: (inputs, targets, outputs)}, float32 [B, H, W, S] each, of objectives that
             have one.
     """
@@ -50,18 +50,40 @@ class Result(NamedTuple):
     pictures: dict[str, tuple]
 
 
-def train(config: Config, out: str | Path, *, progress: bool = True) -> Result:
+class Evaluating(NamedTuple):
+    """An evaluation under way: its result to come, and the policy's parameters, env steps and updates."""
+
+    future: Future
+    params: Params
+    env_steps: int
+    updates: int
+
+
+def train(
+    config: Config,
+    out: str | Path,
+    *,
+    progress: bool = True,
+    resume: checkpoint.Manifest | None = None,
+    stop: Callable[[], bool] = lambda: False,
+) -> Result:
     """Trains one agent, writing `metrics.jsonl` and `checkpoints/` into a run directory that exists.
 
     Args:
         config: of the run, resolved.
         out: the run directory.
         progress: whether to draw a progress bar on stderr.
+        resume: the checkpoint of the same configuration to go on from, found whole by
+            `srl_jax.checkpoint.verify`; what follows is what would have followed had the run not ended there.
+        stop: asked after each step; once it says so, a checkpoint is written and training ends. A
+            KeyboardInterrupt instead, in the middle of a step, leaves the last checkpoint.
 
     Raises:
-        srl_jax.specs.ConfigError: a spec or a checkpoint to start from does not fit.
+        ConfigError: a spec or a checkpoint to start from does not fit.
+        Diverged: a loss is no longer finite; the last checkpoint is from before.
+        SaveError: something could not be written; the last checkpoint is whole.
     """
-    return Run(config, Path(out), progress).train()
+    return Run(config, Path(out), progress, resume=resume, stop=stop).train()
 
 
 def greedy_policy(agent: Agent, params: Any, key: jax.Array) -> Policy:
@@ -91,16 +113,6 @@ def act_and_step(policy: Policy, observations: np.ndarray, step: int, epsilon: f
     return actions, env.step(actions)
 
 
-def means(log: list[dict[str, np.ndarray]]) -> dict[str, np.float32]:
-    """The mean of each metric over the updates that measured it: that have it, and not a norm that is NaN."""
-    values = {}
-    for row in log:
-        for name, x in row.items():
-            if not (name.startswith("grad_norm/") and np.isnan(x)):
-                values.setdefault(name, []).append(x)
-    return {name: np.float32(np.mean(x, dtype=np.float64)) for name, x in values.items()}
-
-
 def make_env(config: Config, num_envs: int, seed: int):
     """The environments of a run's game and protocol, see `srl_jax.envs.make`."""
     return envs.make(
@@ -117,20 +129,29 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
     """An agent, its parameters and the manifest of a checkpoint or of a run's newest one.
 
     Raises:
-        srl_jax.specs.ConfigError: there is none, it is damaged, or does not fit this code.
+        srl_jax.errors.ConfigError: there is none, it is damaged, or does not fit this code.
     """
     manifest = checkpoint.read_manifest(path)
     agent = make_agent(manifest.config, manifest.num_actions)
-    template = jax.eval_shape(agent.init, jax.random.key(0)).params
-    params = checkpoint.load_into(template, checkpoint.load(manifest), str(manifest.path))
+    params = checkpoint.load_into(agent.shapes().params, checkpoint.load(manifest), str(manifest.path))
     return agent, params, manifest
 
 
 class Run:
-    """One training run; its attributes are everything that changes while it runs."""
+    """One training run; its attributes are everything that changes while it runs: see `srl_jax.snapshot`."""
 
-    def __init__(self, config: Config, out: Path, progress: bool, agent: Agent | None = None):
-        self.config, self.out = config, out
+    def __init__(
+        self,
+        config: Config,
+        out: Path,
+        progress: bool,
+        agent: Agent | None = None,
+        *,
+        resume: checkpoint.Manifest | None = None,
+        stop: Callable[[], bool] = lambda: False,
+    ):
+        self.config, self.out, self.stop = config, out, stop
+        self.checkpoint_every = config.checkpoint_every or config.eval_every
         # One thread for the training environments and one for evaluation. They are made there, so that the
         # threads that they start yield to the device's, too.
         self.env_thread = ThreadPoolExecutor(1, "environments", yield_to_others)
@@ -152,67 +173,81 @@ class Run:
             alpha=self.agent.algorithm.alpha if self.agent.mode.rl else 0.0,
             seed=seed_for(config.seed, "replay"),
         )
-        self.random = random_policy(self.num_actions, seed_for(config.seed, "random policy"))
+        self.random = np.random.default_rng(seed_for(config.seed, "random policy"))
         self.given = self.given_policy() if config.policy_from else None
         self.act_key = named_key(self.key, "act")
         self.eval_key = named_key(self.key, "eval")
         self.eval_env = None
-        self.evaluating: tuple | None = None  # a future, and the env steps and updates of the policy
+        self.evaluating: Evaluating | None = None
         self.stopped = False  # says to the evaluation that nobody waits for it
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
         self.env_steps = self.updates = 0
-        self.log: list[dict] = []  # metrics of the updates since the last row, still on the device
-        self.returns: list[float] = []  # of the training episodes that ended since the last row
-        self.evaluation = float("nan")
-        self.started = time.perf_counter()
-        self.progress = Progress(config.steps, stream=None if progress else _Nowhere())
-        self.last_row = (0.0, 0)
+        self.solved = False  # an evaluation has reached the return that ends the run
+        self.report = Report(
+            out, config.steps, self.agent.fetch, progress=progress, tensorboard=config.tensorboard
+        )
+        self.saved: checkpoint.Manifest | None = None  # the newest checkpoint
+        self.saved_position = self.replay.next_position.copy()  # replay's, when it was written
+        self.resumed = resume is not None
+        if resume is not None:
+            snapshot.put(self, resume)
 
     def train(self) -> Result:
-        """Runs to the end, or to Ctrl-C."""
-        config = self.config
-        interrupted = False
-        events = self.out / "tensorboard" if config.tensorboard else None
-        with (
-            MetricsWriter(self.out / "metrics.jsonl", events) as self.writer,
-            self.progress,
-            self.env_thread,
-            self.eval_thread,
-        ):
-            try:
-                self.run()
-            except (KeyboardInterrupt, BrokenBarrierError):  # the latter where another seed was the first
-                interrupted = True
-                self.progress.note(f"interrupted after {self.env_steps} env steps; saving")
-            finally:
-                self.stopped = True
-            self.save()
-            pictures = self.pictures()
+        """Runs to the end, or until it is told to stop."""
+        finished = False
+        try:
+            with self.report, self.env_thread, self.eval_thread:
+                try:
+                    finished = self.run()
+                except (KeyboardInterrupt, BrokenBarrierError):  # the latter where another seed was the first
+                    last = "there is no checkpoint"
+                    if self.saved is not None:
+                        last = f"the last checkpoint is of {self.saved.env_steps}"
+                    self.report.progress.note(f"interrupted after {self.env_steps} env steps; {last}")
+                finally:
+                    self.stopped = True
+                pictures = self.pictures()
+        finally:
             self.env.close()
             if self.eval_env is not None:
                 self.eval_env.close()
-        return Result(self.env_steps, self.updates, interrupted, pictures)
+        return Result(self.env_steps, self.updates, not finished, pictures)
 
-    def run(self) -> None:
-        """From the first reset to the last env step, or to the return that ends the run."""
+    def run(self) -> bool:
+        """To the last env step, or to the return that ends the run; False where it was told to stop."""
         config = self.config
-        self.start()
-        self.start_evaluation()
-        while self.env_steps < config.steps:
+        if not self.resumed:
+            self.start()
+            self.start_evaluation(self.state.params, 0, 0)
+        while self.env_steps < config.steps and not self.solved:
+            if self.agent.agree(self.stop()):
+                self.save()
+                self.report.progress.note(
+                    f"stopped after {self.env_steps} env steps; a checkpoint is written"
+                )
+                return False
             before = self.env_steps
             self.step()
             rows = self.passed(before, config.log_every), self.passed(before, config.eval_every)
-            if any(rows) and self.finish_evaluation():
-                return
+            if any(rows):
+                self.finish_evaluation()
+                if self.solved:
+                    break
             if rows[0]:
                 self.write_train_row()
             if rows[1]:
-                self.start_evaluation()
-            if self.passed(before, config.checkpoint_every or config.eval_every):
+                self.start_evaluation(self.state.params, self.env_steps, self.updates)
+            if (
+                self.passed(before, config.checkpoint_every or config.eval_every)
+                and self.env_steps < config.steps
+            ):
                 self.save()
-            self.progress.update(self.env_steps)
+            self.report.progress.update(self.env_steps)
         self.finish_evaluation()
+        self.check_losses()
+        self.finish()
+        return True
 
     def start(self) -> None:
         """Resets the training environments."""
@@ -246,7 +281,7 @@ class Run:
         self.env_steps += number
         over = terminated | truncated
         if over.any():
-            self.returns += self.score[over].tolist()
+            self.report.ended(self.score[over])
             self.score[over] = 0.0
             frames, _ = self.env.reset(options={"reset_mask": over})
             self.stacks.begin(frames, over)
@@ -259,7 +294,7 @@ class Run:
         """The behaviour policy, of the parameters as they are now."""
         if self.agent.mode.rl:
             return _policy(self.agent.act, self.state, self.act_key)
-        return self.given or self.random
+        return self.given or random_policy(self.num_actions, self.random)
 
     @property
     def epsilon(self) -> float:
@@ -306,11 +341,14 @@ class Run:
         self.updates += 1
         if self.agent.follow_every and self.updates % self.agent.follow_every == 0:
             self.state = self.agent.follow(self.state)
-        self.log.append(metrics)
+        self.report.means.add(metrics)
         if td_error is None:
             jax.block_until_ready(metrics)  # or windows would pile up
-        else:
-            self.replay.set_priorities(indices, np.asarray(td_error))
+            return
+        td_error = np.asarray(td_error)
+        if not np.isfinite(td_error).all():
+            self.check_losses()
+        self.replay.set_priorities(indices, td_error)
 
     # Reporting
 
@@ -319,34 +357,37 @@ class Run:
         return self.env_steps // every > before // every
 
     def write_train_row(self) -> None:
-        """A "train" row: means over the updates and episodes since the last one."""
-        now = time.perf_counter() - self.started
-        wall, steps = self.last_row
-        values = {
-            "epsilon": self.epsilon,
-            "beta": self.beta,
-            "replay/transitions": len(self.replay),
-            "train/episodes": len(self.returns),
-            "train/return_mean": float(np.mean(self.returns)) if self.returns else None,
-            "wall_steps_per_s": (self.env_steps - steps) / max(now - wall, 1e-9),
-        }
-        values |= means(self.agent.fetch(self.log))
-        self.writer.write("train", self.env_steps, self.updates, now, values)
-        shown = {n.removeprefix("loss/"): v for n, v in values.items() if n.startswith("loss/")}
-        shown.pop("total", None)
-        if self.returns:
-            shown["return"] = values["train/return_mean"]
-        self.progress.update(self.env_steps, **shown)
-        self.last_row = (now, self.env_steps)
-        self.log, self.returns = [], []
+        """A "train" row: schedules, and means since the last one."""
+        self.check_losses()
+        values = {"epsilon": self.epsilon, "beta": self.beta, "replay/transitions": len(self.replay)}
+        self.report.train_row(self.env_steps, self.updates, values)
 
-    def start_evaluation(self) -> None:
-        """Has the policy of now evaluated, in a thread, while training goes on; where the mode has one."""
+    def check_losses(self) -> None:
+        """Whether all losses since the last row were finite.
+
+        Raises:
+            Diverged: one was not.
+        """
+        if (name := self.report.means.broken()) is not None:
+            raise Diverged(
+                f"{name} is not finite after {self.env_steps} env steps and {self.updates} updates; "
+                "the checkpoints are from before"
+            )
+
+    def start_evaluation(self, params: Params, env_steps: int, updates: int) -> None:
+        """Has the policy of these parameters evaluated, in a thread, while training goes on.
+
+        Nothing happens in a mode without RL.
+
+        Args:
+            params: which nothing changes.
+            env_steps, updates: when the run had them.
+        """
         config = self.config
         if not self.agent.mode.rl:
             return
-        policy = greedy_policy(self.agent, self.state.params, self.eval_key)
-        seed = seed_for(config.seed, "eval", self.env_steps)
+        policy = greedy_policy(self.agent, params, self.eval_key)
+        seed = seed_for(config.seed, "eval", env_steps)
 
         def play() -> tuple[Evaluation | None, float]:
             began = time.perf_counter()
@@ -364,43 +405,71 @@ class Run:
             )
             return played, time.perf_counter() - began
 
-        self.evaluating = self.eval_thread.submit(play), self.env_steps, self.updates
+        self.evaluating = Evaluating(self.eval_thread.submit(play), params, env_steps, updates)
 
-    def finish_evaluation(self) -> bool:
-        """Waits for the evaluation that is under way, writes its row; whether its return ends the run.
+    def finish_evaluation(self) -> None:
+        """Waits for the evaluation that is under way, writes its row; sets `solved`.
 
         Called before the next row is written, so that rows are in the same order however long games take.
         """
         if self.evaluating is None:
-            return False
-        (future, env_steps, updates), self.evaluating = self.evaluating, None
+            return
+        (future, _, env_steps, updates), self.evaluating = self.evaluating, None
         played, seconds = future.result()
-        self.evaluation = float(np.mean(played.returns))
+        mean = float(np.mean(played.returns))
         values = {
-            "eval/return_mean": self.evaluation,
+            "eval/return_mean": mean,
             "eval/returns": played.returns,
             "eval/lengths": played.lengths,
             "wall_eval_s": round(seconds, 3),
         }
-        self.writer.write("eval", env_steps, updates, time.perf_counter() - self.started, values)
-        self.progress.note(
-            f"evaluation after {env_steps} env steps: mean return {self.evaluation:.2f} "
+        self.report.eval_row(env_steps, updates, values)
+        self.report.progress.note(
+            f"evaluation after {env_steps} env steps: mean return {mean:.2f} "
             f"over {len(played.returns)} games, {seconds:.1f} s"
         )
-        self.progress.update(self.env_steps, evaluation=self.evaluation)
-        config = self.config
-        solved = config.stop_at_return is not None and self.evaluation >= config.stop_at_return
-        return self.agent.agree(solved)
+        self.report.progress.update(self.env_steps, evaluation=mean)
+        wanted = self.config.stop_at_return
+        self.solved = self.agent.agree(wanted is not None and mean >= wanted)
 
     def save(self) -> None:
-        """Writes a checkpoint."""
-        checkpoint.save(
+        """Writes a checkpoint that can be gone on from, unless there is one of this moment."""
+        if self.saved is not None and self.saved.env_steps == self.env_steps:
+            return
+        self.check_losses()
+        self.saved = checkpoint.save(
             self.out,
             self.state.params,
             self.config,
             num_actions=self.num_actions,
             env_steps=self.env_steps,
             updates=self.updates,
+            state=snapshot.take(self),
+            base=self.saved,
+        )
+        self.saved_position = self.replay.next_position.copy()
+        every = self.config.keep_encoder_every
+        if every and self.env_steps // self.checkpoint_every % every == 0:
+            self.save_parameters("encoders", {"encoder": self.state.params["encoder"], "heads": {}}, keep=0)
+
+    def finish(self) -> None:
+        """Writes the last checkpoint: of parameters alone, and leaves no more of the one before."""
+        before = self.saved if self.saved and self.saved.env_steps < self.env_steps else None
+        self.save_parameters("checkpoints", self.state.params, keep=2)
+        if before is not None:
+            checkpoint.slim(before)
+
+    def save_parameters(self, folder: str, params: Params, keep: int) -> None:
+        """Writes a checkpoint that has parameters alone."""
+        checkpoint.save(
+            self.out,
+            params,
+            self.config,
+            num_actions=self.num_actions,
+            env_steps=self.env_steps,
+            updates=self.updates,
+            keep=keep,
+            folder=folder,
         )
 
     def pictures(self) -> dict[str, tuple]:
@@ -440,13 +509,3 @@ class Run:
         if manifest.num_actions != self.num_actions:
             raise ValueError("the policy is for another number of actions")
         return greedy_policy(agent, params, named_key(self.key, "given policy"))
-
-
-class _Nowhere:
-    """A stream that takes everything and shows nothing."""
-
-    def write(self, text: str) -> None:
-        pass
-
-    def flush(self) -> None:
-        pass

@@ -5,26 +5,41 @@ other value must be a function of the configuration and the seed. Two runs of th
 same machine therefore have equal rows once `strip_wall` has been applied.
 """
 
+import hashlib
 import json
 import math
 import numbers
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+from srl_jax.errors import ConfigError
 
 KINDS = ("train", "eval")
 LEADING = ("kind", "env_steps", "updates", "wall_s")
 """The keys that every row begins with, in this order; the rest follow sorted."""
 
 
+class Mark(NamedTuple):
+    """A place in a file.
+
+    Attributes:
+        bytes: before it.
+        sha256: of these.
+    """
+
+    bytes: int
+    sha256: str
+
+
 class MetricsWriter:
     """Appends rows to a file of JSON objects, one a line, each flushed as it is written.
 
-    An existing file is continued. What a killed process left of its last line is removed first, so
-    that the next row does not run into it.
+    An existing file is continued: from a `Mark`, which cuts it back to what it was then, or from its end.
+    What a killed process left of its last line is removed first, so that the next row does not run into it.
 
     Numbers are written so that they read back as they were: float32 by the shortest decimal that
     gives the same float32, float64 likewise. JSON has no NaN and no infinity: all three of NaN, inf
@@ -34,12 +49,21 @@ class MetricsWriter:
         path: the file, made if it does not exist; its directory must exist.
         tensorboard_dir: where to write TensorBoard events too, or None. Scalars only, under the
             same keys, with env_steps as the step.
+        mark: from `mark`, or None.
+        env_steps: of the mark; TensorBoard hides events from there on.
 
     Raises:
         ImportError: if `tensorboard_dir` is given and tensorboardX is not installed.
+        ConfigError: the file does not begin with what it held at the mark; it is as it was.
     """
 
-    def __init__(self, path: str | os.PathLike, tensorboard_dir: str | os.PathLike | None = None):
+    def __init__(
+        self,
+        path: str | os.PathLike,
+        tensorboard_dir: str | os.PathLike | None = None,
+        mark: Mark | None = None,
+        env_steps: int = 0,
+    ):
         self._events = None
         if tensorboard_dir is not None:
             try:
@@ -48,9 +72,12 @@ class MetricsWriter:
                 raise ImportError(
                     "TensorBoard events need tensorboardX: pip install srl-jax[tensorboard]"
                 ) from error
-            self._events = SummaryWriter(str(tensorboard_dir))
+            self._events = SummaryWriter(str(tensorboard_dir), purge_step=env_steps + 1 if mark else None)
+        if mark is not None:
+            _cut(Path(path), mark)
         _mend(Path(path))
-        self._file = open(path, "a", encoding="utf-8", newline="\n")
+        self._digest = hashlib.sha256(Path(path).read_bytes() if os.path.isfile(path) else b"")
+        self._file = open(path, "ab")
 
     def write(
         self, kind: str, env_steps: int, updates: int, wall_s: float, values: Mapping[str, Any]
@@ -81,13 +108,20 @@ class MetricsWriter:
             "wall_s": round(float(wall_s), 3),
             **rest,
         }
-        self._file.write(json.dumps(row, allow_nan=False) + "\n")
+        line = (json.dumps(row, allow_nan=False) + "\n").encode()
+        self._file.write(line)
         self._file.flush()
+        self._digest.update(line)
         if self._events is not None:
             for key, value in rest.items():
                 if isinstance(value, int | float):
                     self._events.add_scalar(key, value, row["env_steps"])
             self._events.flush()
+
+    def mark(self) -> Mark:
+        """Where the file ends now, flushed to disk."""
+        os.fsync(self._file.fileno())
+        return Mark(self._file.tell(), self._digest.hexdigest())
 
     def close(self) -> None:
         """Closes the files. A second call does nothing."""
@@ -139,6 +173,18 @@ def _parse(line: bytes) -> dict[str, Any]:
     if not isinstance(row, dict):
         raise ValueError("not a JSON object")
     return row
+
+
+def _cut(path: Path, mark: Mark) -> None:
+    try:
+        with open(path, "r+b") as file:
+            if hashlib.sha256(file.read(mark.bytes)).hexdigest() != mark.sha256:
+                raise ConfigError(f"{path}: does not begin with the rows that the checkpoint knows")
+            file.truncate(mark.bytes)
+    except OSError as error:
+        raise ConfigError(
+            f"{path}: {error.strerror}; the checkpoint knows {mark.bytes} bytes of it"
+        ) from None
 
 
 def _mend(path: Path) -> None:

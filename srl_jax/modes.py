@@ -5,7 +5,7 @@ A mode is a row of `MODES`; the thesis' hypothesis 1 compares them.
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from srl_jax.specs import ConfigError
+from srl_jax.errors import ConfigError
 
 if TYPE_CHECKING:
     from srl_jax.config import Config

@@ -12,11 +12,9 @@ import math
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
+from srl_jax.errors import ConfigError
+
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
-
-
-class ConfigError(ValueError):
-    """A setting that cannot be run; one line that names the flag and the valid choices."""
 
 
 class SpecError(ConfigError):

@@ -16,7 +16,7 @@ from experiments.benchmarks.rows import ROWS, SERIES, SIDES, Row, Series, Side
 from experiments.benchmarks.runner import CheckFailed, Results
 from experiments.benchmarks.table import Goal
 from experiments.benchmarks.worker import Worker, WorkerError
-from srl_jax.specs import ConfigError
+from srl_jax.errors import ConfigError
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 SERVE = """

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from srl_jax import checkpoint
 from srl_jax.config import Config
-from srl_jax.specs import ConfigError
+from srl_jax.errors import ConfigError
 from tests.helpers import identical
 
 CONFIG = Config(game="Catch", frame_size=42, encoder="tiny:features=8", seed=5, lr_rl=1 / 3)

@@ -15,7 +15,7 @@ from experiments import flags as config_flags
 from experiments import train
 from experiments.presets import PRESETS
 from srl_jax.config import INFOS, Config
-from srl_jax.specs import ConfigError
+from srl_jax.errors import ConfigError
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 JOINT = ["--game=Catch", "--mode=joint", "--objective=reconstruction"]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from srl_jax import config as config_module
 from srl_jax import modes
 from srl_jax.config import INFOS, Config, resolve
-from srl_jax.specs import ConfigError
+from srl_jax.errors import ConfigError
 
 
 def _rl(context, *, n_step: int = 3, alpha: float = 0.5):

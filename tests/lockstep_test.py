@@ -7,9 +7,9 @@ import pytest
 
 from srl_jax import checkpoint, loop
 from srl_jax.config import Config
+from srl_jax.errors import ConfigError
 from srl_jax.lockstep import Together, train_seeds
 from srl_jax.metrics import read_metrics
-from srl_jax.specs import ConfigError
 
 CONFIG = dict(
     game="Catch", mode="joint", frame_size=42, encoder="tiny:features=8", objectives=("inverse",), num_envs=2,

@@ -9,8 +9,8 @@ import pytest
 
 from srl_jax import checkpoint, loop
 from srl_jax.config import Config
+from srl_jax.errors import ConfigError
 from srl_jax.metrics import read_metrics, strip_wall
-from srl_jax.specs import ConfigError
 from srl_jax.update import Hyper
 
 SMALL = {

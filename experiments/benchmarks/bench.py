@@ -26,7 +26,8 @@ from experiments.benchmarks.rows import CHECK_UPDATES, ROWS, SIDES, Side, series
 from experiments.benchmarks.runner import TOLERANCE, CheckFailed, Results, measure
 from experiments.benchmarks.worker import ROOT, Worker, WorkerError
 from srl_jax.config import git_revision, versions
-from srl_jax.specs import ConfigError, choices_text
+from srl_jax.errors import ConfigError
+from srl_jax.specs import choices_text
 
 FLAGS = flags.FLAGS
 PYTHON = ".venv-bench/bin/python"

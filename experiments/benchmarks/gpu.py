@@ -15,7 +15,7 @@ from absl import flags
 from experiments import flags as config_flags
 from experiments.benchmarks.bench import check_out
 from srl_jax.config import versions
-from srl_jax.specs import ConfigError
+from srl_jax.errors import ConfigError
 
 FLAGS = flags.FLAGS
 NATURE, JOINT = "thesis/rl_only_nature", "thesis/joint_256"

@@ -1,0 +1,165 @@
+"""Run directories: new ones, ones to overwrite, ones to go on from; one writer at a time."""
+
+import contextlib
+import json
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+from experiments import flags as config_flags
+from srl_jax import checkpoint, rundir
+from srl_jax.checkpoint import Manifest
+from srl_jax.config import Config, difference, told_to_xla
+from srl_jax.errors import ConfigError, SaveError
+
+
+def say(line: str) -> None:
+    """A line for whoever watches, on stderr."""
+    print(f"resume: {line}", file=sys.stderr)
+
+
+def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:
+    """Whether a run can be written there; writes nothing.
+
+    Args:
+        out: the path, or None where it was not given.
+        config: what it starts from must not be deleted.
+        overwrite: a run that lies there may be deleted.
+        resume: a run that lies there will be gone on with.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if not out:
+        raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
+    if overwrite and resume:
+        raise ConfigError("--resume=auto: goes on with the run that --overwrite deletes; give one of them")
+    path = config_flags.check_place("out", out)
+    try:
+        if not path.is_dir() or not any(path.iterdir()):
+            return path
+        if resume:
+            if not _is_run(path):
+                raise ConfigError(f"--out={out}: not a run directory, so --resume=auto cannot go on from it")
+            return path
+        if not overwrite:
+            raise ConfigError(
+                f"--out={out}: not empty; name a new directory, or --resume=auto goes on with the run, "
+                "or --overwrite deletes it"
+            )
+        if path.is_symlink() or not _is_run(path):
+            raise ConfigError(f"--out={out}: not a run directory, so --overwrite does not delete it")
+    except OSError as error:
+        raise ConfigError(f"--out={out}: {error.strerror}") from None
+    kept = {"encoder_from": config.encoder_from, "policy_from": config.policy_from}
+    for flag, source in kept.items():
+        if source and Path(source).resolve().is_relative_to(path.resolve()):
+            raise ConfigError(f"--out={out}: --overwrite would delete --{flag}={source}")
+    if Path.cwd().is_relative_to(path.resolve()):
+        raise ConfigError(f"--out={out}: --overwrite would delete the working directory")
+    return path
+
+
+def _is_run(path: Path) -> bool:
+    """Whether the directory, or one of seeds in it, holds a config.json that this program wrote."""
+    for file in (path / "config.json", *sorted(path.glob("seed*/config.json"))):
+        try:
+            values = json.loads(file.read_text(encoding="utf-8"))
+        except (OSError, ValueError, RecursionError):
+            continue
+        if isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys():
+            return True
+    return False
+
+
+@contextlib.contextmanager
+def run_directory(path: Path, config: Config) -> Iterator[None]:
+    """Makes the run directory with its config.json; unmakes it if what follows refuses the config.
+
+    Args:
+        path: as `check_out` returned it; a run that lies there is deleted.
+        config: resolved; written to config.json.
+
+    Raises:
+        ConfigError: it cannot be made, or another process writes there.
+        SaveError: config.json could not be written.
+    """
+    made, written = [], False
+    try:
+        try:
+            missing = [p for p in (path, *path.absolute().parents) if not p.exists()]
+            for directory in reversed(missing):
+                directory.mkdir()
+                made.append(directory)
+        except OSError as error:
+            raise ConfigError(f"--out={path}: {error.strerror}") from None
+        with rundir.held(path):
+            try:
+                for old in path.iterdir():
+                    if old.name != rundir.LOCK:
+                        shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+                config.save(path)
+                written = True
+            except OSError as error:
+                raise SaveError(f"--out={path}: {error.strerror}") from None
+            yield
+    except ConfigError:
+        # Only what was made here goes: once anything else lies there, all of it stays.
+        with contextlib.suppress(OSError):
+            if written and [file.name for file in path.iterdir()] == ["config.json"]:
+                (path / "config.json").unlink()
+        with contextlib.suppress(OSError):
+            for directory in reversed(made):
+                directory.rmdir()
+        raise
+
+
+def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifest | None:
+    """The checkpoint from which the run in a directory can go on; writes nothing.
+
+    Args:
+        path: of a run directory, or of one that is still to be made.
+        config: resolved.
+        at_most: env steps; newer checkpoints do not count.
+
+    Returns:
+        The manifest of the newest one that is whole, or None where the run has to begin. One without
+        `srl_jax.checkpoint.NUMBERS` among its files is of a run that has ended.
+
+    Raises:
+        ConfigError: another process writes there, or the run has another configuration, or its checkpoints
+            are all damaged.
+    """
+    if not path.is_dir() or not any(path.iterdir()):
+        return None
+    rundir.check_free(path)
+    if differing := difference(Config.load(path), config):
+        raise ConfigError(f"--out={path}: the run there has another configuration: {differing}")
+    manifest = checkpoint.newest_good(path, say, at_most)
+    if manifest is None:
+        say(f"{path}: no checkpoint there yet; the run begins again")
+        return None
+    if differing := difference(manifest.config, config):
+        raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
+    about = json.loads((path / "config.json").read_text(encoding="utf-8"))
+    then, now = about.get("environment"), told_to_xla()
+    if then != now:
+        say(f"{path}: XLA was told {then} and is told {now} now: roundings differ")
+    return manifest
+
+
+def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
+    """`to_resume` of runs that go on in step: checkpoints of the same env step, or None for all."""
+    at_most = None
+    while True:
+        found = [to_resume(path, config, at_most) for path, config in runs]
+        if None in found:
+            return [None] * len(runs)
+        steps = {manifest.env_steps for manifest in found}
+        if len(steps) == 1:
+            return found
+        at_most = min(steps)

@@ -1,0 +1,16 @@
+"""What a run may end with, apart from its end: errors of one line, each with an exit status of its own."""
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be run; one line that names the flag and the valid choices. Exit status 2."""
+
+
+class SaveError(Exception):
+    """A checkpoint or a row could not be written, say on a full disk; one line. Exit status 3."""
+
+
+class Diverged(Exception):
+    """A loss is NaN or infinite; one line with the step and its name. Exit status 4."""
+
+
+EXIT_STATUS = {ConfigError: 2, SaveError: 3, Diverged: 4}

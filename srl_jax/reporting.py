@@ -1,0 +1,173 @@
+"""What a run says of itself: rows of metrics.jsonl, the progress bar, and the means between two rows."""
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from srl_jax.errors import SaveError
+from srl_jax.metrics import Mark, MetricsWriter
+from srl_jax.progress import Progress
+
+FOLD_EVERY = 100
+"""Updates after which their metrics are fetched from the device and summed, so that memory does not grow with
+the distance of two rows."""
+
+
+class Means:
+    """The mean of each metric over the updates that measured it, with bounded memory.
+
+    A norm that is NaN was not measured. Sums are float64, in the order of the updates.
+
+    Args:
+        fetch: list of updates' metrics, {name: scalar on the device} -> the same on the host.
+    """
+
+    def __init__(self, fetch: Callable[[list[dict]], list[dict]]):
+        self._fetch = fetch
+        self._waiting: list[dict] = []
+        self._sums: dict[str, tuple[float, int]] = {}
+
+    def add(self, metrics: dict[str, Any]) -> None:
+        """Takes an update's metrics; does not wait for the device, but every `FOLD_EVERY`th time."""
+        self._waiting.append(metrics)
+        if len(self._waiting) >= FOLD_EVERY:
+            self._fold()
+
+    def _fold(self) -> None:
+        for row in self._fetch(self._waiting):
+            for name, x in row.items():
+                if not (name.startswith("grad_norm/") and np.isnan(x)):
+                    total, count = self._sums.get(name, (0.0, 0))
+                    self._sums[name] = total + float(x), count + 1
+        self._waiting = []
+
+    def broken(self) -> str | None:
+        """The name of a loss that was NaN or infinite since the last row, or None. Waits for the device."""
+        self._fold()
+        names = sorted(self._sums, key=lambda name: name == "loss/total")
+        return next((n for n in names if n.startswith("loss/") and not np.isfinite(self._sums[n][0])), None)
+
+    def take(self) -> dict[str, np.float32]:
+        """The means, and starts anew. Waits for the device."""
+        self._fold()
+        sums, self._sums = self._sums, {}
+        return {name: np.float32(total / count) for name, (total, count) in sums.items()}
+
+    def snapshot(self) -> dict[str, list]:
+        """As JSON values, exact."""
+        self._fold()
+        return {name: [total.hex(), count] for name, (total, count) in self._sums.items()}
+
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from there."""
+        self._sums = {str(n): (float.fromhex(total), int(count)) for n, (total, count) in snapshot.items()}
+
+
+class Report:
+    """metrics.jsonl, TensorBoard and progress of one run; a context in which they are open.
+
+    Args:
+        out: the run directory.
+        total: env steps of the whole run.
+        fetch: see `Means`.
+        progress: whether to draw a progress bar on stderr.
+        tensorboard: whether to write its events.
+    """
+
+    def __init__(self, out: Path, total: int, fetch: Callable, *, progress: bool, tensorboard: bool):
+        self.path = Path(out or ".") / "metrics.jsonl"
+        self._events = self.path.parent / "tensorboard" if tensorboard else None
+        self.progress = Progress(total, stream=None if progress else _Nowhere())
+        self.means = Means(fetch)
+        self._started = time.perf_counter()
+        self._return_sum, self._episodes = 0.0, 0  # of training episodes that ended since the last row
+        self._last_row = 0.0, 0  # seconds, env steps
+        self._mark: Mark | None = None
+        self._begun = 0
+
+    def __enter__(self) -> "Report":
+        self._writer = MetricsWriter(self.path, self._events, self._mark, self._begun)
+        self.progress.__enter__()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.progress.__exit__(*error)
+        self._writer.close()
+
+    @property
+    def seconds(self) -> float:
+        """Since the run began, without those between being killed and going on."""
+        return time.perf_counter() - self._started
+
+    def ended(self, returns: np.ndarray) -> None:
+        """Takes the raw scores of training episodes that have ended, float64 [n]."""
+        for score in returns.tolist():
+            self._return_sum += score
+            self._episodes += 1
+
+    def train_row(self, env_steps: int, updates: int, values: Mapping[str, Any]) -> None:
+        """A "train" row: the values, and means over the updates and episodes since the last one."""
+        now = self.seconds
+        wall, steps = self._last_row
+        mean = self._return_sum / self._episodes if self._episodes else None
+        own = {
+            "train/episodes": self._episodes,
+            "train/return_mean": mean,
+            "wall_steps_per_s": (env_steps - steps) / max(now - wall, 1e-9),
+        }
+        values = {**values, **own, **self.means.take()}
+        self._write("train", env_steps, updates, now, values)
+        shown = {n.removeprefix("loss/"): v for n, v in values.items() if n.startswith("loss/")}
+        shown.pop("total", None)
+        if mean is not None:
+            shown["return"] = mean
+        self.progress.update(env_steps, **shown)
+        self._last_row = now, env_steps
+        self._return_sum, self._episodes = 0.0, 0
+
+    def eval_row(self, env_steps: int, updates: int, values: Mapping[str, Any]) -> None:
+        """An "eval" row."""
+        self._write("eval", env_steps, updates, self.seconds, values)
+
+    def _write(self, kind: str, env_steps: int, updates: int, seconds: float, values: Mapping) -> None:
+        try:
+            self._writer.write(kind, env_steps, updates, seconds, values)
+        except OSError as error:
+            raise SaveError(f"{self.path}: a row was not written: {error.strerror}") from error
+
+    def snapshot(self) -> dict[str, Any]:
+        """As JSON values; rows written so far are flushed to disk."""
+        try:
+            mark = self._writer.mark()
+        except OSError as error:
+            raise SaveError(f"{self.path}: not flushed: {error.strerror}") from error
+        return {
+            "metrics": mark._asdict(),
+            "seconds": self.seconds,
+            "last_row": list(self._last_row),
+            "returns": [self._return_sum, self._episodes],
+            "means": self.means.snapshot(),
+        }
+
+    def restore(self, snapshot: Mapping[str, Any], env_steps: int) -> None:
+        """Goes on from there; before the report is entered, which cuts metrics.jsonl back."""
+        self._mark, self._begun = Mark(**snapshot["metrics"]), env_steps
+        self._started = time.perf_counter() - float(snapshot["seconds"])
+        wall, steps = snapshot["last_row"]
+        self._last_row = float(wall), int(steps)
+        total, count = snapshot["returns"]
+        self._return_sum, self._episodes = float(total), int(count)
+        self.means.restore(snapshot["means"])
+
+
+class _Nowhere:
+    """A stream that takes everything and shows nothing."""
+
+    def write(self, text: str) -> None:
+        pass
+
+    def flush(self) -> None:
+        pass
