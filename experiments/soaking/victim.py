@@ -1,0 +1,127 @@
+"""A training run that is meant to be killed: `python -m experiments.soaking.victim DIGEST FAULT FLAGS...`.
+
+It is `experiments.train` with the given flags, and says "begun" on stdout when training begins. When the run
+has ended it writes DIGEST, a JSON object of sums of everything that the run is. FAULT is the number of the
+operation of writing checkpoints at which it kills itself, or -1; the operation's name is left in DIGEST.fault.
+"""
+
+import hashlib
+import itertools
+import json
+import os
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from absl import flags
+
+from experiments import flags as config_flags
+from experiments import train
+
+
+def digest(run: Any) -> dict[str, str]:
+    """Sums of parameters, slow copies, optimizer, keys, replay with priorities, generators, environments."""
+    import jax
+
+    def of(array: Any) -> str:
+        return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
+
+    state = run.agent.export(run.state)
+    state = state._replace(key=jax.random.key_data(state.key))
+    sums = {f"state{jax.tree_util.keystr(k)}": of(x) for k, x in jax.tree_util.tree_leaves_with_path(state)}
+    arrays, numbers = run.replay.snapshot()
+    sums |= {f"replay {name}": of(x) for name, x in arrays.items()}
+    sums |= {f"replay {name}": json.dumps(x) for name, x in numbers.items()}
+    sums |= {f"environments {name}": of(x) for name, x in run.env.snapshot().items()}
+    return sums | {
+        "replay frames": of(run.replay.frames),
+        "stacks": of(run.stacks.frames),
+        "scores": json.dumps(run.score.tolist()),
+        "random policy": json.dumps(run.random.bit_generator.state),
+        "counts": json.dumps([run.env_steps, run.updates]),
+    }
+
+
+class Faults:
+    """Counts the operations of writing checkpoints, and kills the process at one of them.
+
+    Args:
+        at: the operation's number, from 0.
+        fault: called there with the operation's name; returns nothing, if at all.
+    """
+
+    def __init__(self, at: int, fault: Callable[[str], None]):
+        self._at, self._fault = at, fault
+        self._count = itertools.count()
+
+    def point(self, name: str) -> None:
+        """An operation."""
+        if next(self._count) == self._at:
+            self._fault(name)
+
+    def install(self) -> None:
+        """Puts points around what `srl_jax.checkpoint` calls, in this process, for good."""
+        from srl_jax import checkpoint
+
+        for name in ("fsync", "replace", "link", "mkdir"):
+            setattr(os, name, self._around(f"os.{name}", getattr(os, name)))
+        checkpoint.shutil.rmtree = self._around("rmtree", checkpoint.shutil.rmtree)
+        checkpoint.write = self._writing(checkpoint.write)
+
+    def _around(self, name: str, function: Callable) -> Callable:
+        def call(*arguments, **options):
+            self.point(f"before {name}")
+            result = function(*arguments, **options)
+            self.point(f"after {name}")
+            return result
+
+        return call
+
+    def _writing(self, function: Callable) -> Callable:
+        def write(path: Path, pieces: list):
+            kind = path.suffix.removeprefix(".")
+            self.point(f"before a file ({kind})")
+            half = memoryview(pieces[-1]).cast("B")
+            path.write_bytes(bytes(half[: len(half) // 2]))
+            self.point(f"within a file ({kind})")
+            entry = function(path, pieces)
+            self.point(f"after a file ({kind})")
+            return entry
+
+        return write
+
+
+def main(arguments: list[str]) -> int:
+    """Trains; see the module."""
+    path, fault, *rest = arguments
+    values = flags.FlagValues()
+    train.define_flags(values)
+    config_flags.parse(["train", *rest], values)
+
+    from srl_jax import loop
+
+    class Victim(loop.Run):
+        def run(self) -> bool:
+            print("begun", flush=True)
+            return super().run()
+
+        def finish(self) -> None:
+            sums = digest(self)
+            super().finish()
+            Path(path).write_text(json.dumps(sums), encoding="utf-8")
+
+    def die(name: str) -> None:
+        Path(f"{path}.fault").write_text(name, encoding="utf-8")
+        os.kill(os.getpid(), signal.SIGKILL)
+
+    loop.Run = Victim
+    if int(fault) >= 0:
+        Faults(int(fault), die).install()
+    return train.train(values)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
