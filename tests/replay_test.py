@@ -209,6 +209,47 @@ def test_a_bad_snapshot_is_refused_in_one_line_and_changes_nothing(change, messa
     same_state(target, Driver(**options).replay)
 
 
+VALUES = (0, 1, 2, 3, 5, 255, 1e-300, 1e300, -1, np.inf, np.nan, 2**31 - 1, 2**47, 2**63 - 1)
+
+
+@given(experience(), st.data())
+@settings(deadline=None, max_examples=60)
+def test_whatever_is_restored_can_be_gone_on_with(case, data):
+    # A snapshot made up by somebody who knows the checks: refused, or nothing goes wrong afterwards.
+    driver, events = case
+    for row in events:
+        driver.step(row)
+    arrays, numbers = driver.replay.snapshot()
+    for _ in range(data.draw(st.integers(1, 4))):
+        name = data.draw(st.sampled_from(list(arrays)))
+        index = data.draw(st.integers(0, arrays[name].size - 1))
+        with np.errstate(all="ignore"):
+            value = np.array(data.draw(st.sampled_from(VALUES))).astype(arrays[name].dtype)
+        wrong(name, index, value)(arrays, numbers)
+    numbers["max_priority"] = data.draw(st.sampled_from([1.0, 1e300, 1e306]))
+    numbers["num_sampleable"] = int(np.count_nonzero(arrays["priorities"] > 0))
+    replay = Replay(**driver.options)
+    try:
+        replay.restore(arrays, numbers)
+    except ValueError as error:
+        assert "\n" not in str(error)
+        return
+    n = replay.num_streams
+    zeros = np.zeros(n)
+    for i in range(2 * replay.slots):
+        if len(replay):
+            window, indices = replay.sample(4, 0.4)
+            assert np.isfinite(window.weight).all()
+            assert (indices >= 0).all()
+            replay.set_priorities(indices[:1], np.ones(1))
+        if not replay.active.all():
+            waiting = np.flatnonzero(~replay.active)
+            replay.begin(np.zeros((len(waiting), 2, 2), np.uint8), waiting)
+        over = zeros.astype(bool) if i % 5 else ~zeros.astype(bool)
+        replay.add(zeros.astype(int), zeros, over, over, over, np.zeros((n, 2, 2), np.uint8))
+        assert len(replay) == len(replay.sampleable()) == np.count_nonzero(replay.tree.leaves)
+
+
 @given(experience(), st.data())
 @settings(deadline=None, max_examples=60)
 def test_changed_slots_are_those_whose_frames_differ(case, data):
