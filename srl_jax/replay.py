@@ -9,6 +9,9 @@ slot can be sampled from the moment its whole horizon is known (the `horizon` ob
 are stored, or the episode ended within them) until fewer than `stack - 1` older slots are left.
 """
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 
 from srl_jax.sumtree import SumTree
@@ -16,6 +19,9 @@ from srl_jax.types import Window
 
 _ENDED = 1  # the next observation is the episode's last one
 _TERMINAL = 2  # the discount of this step is 0
+
+_ARRAYS = ("actions", "rewards", "flags", "age", "next_position", "episode_start", "active")
+_NUMBERS = ("max_priority", "num_transitions", "num_sampleable")
 
 PRIORITY_EPSILON = 1e-6
 """Added to |TD error|, so that every transition keeps a chance (Schaul et al. 2016, sec. 3.3)."""
@@ -255,6 +261,110 @@ class Replay:
             leaves, priorities = leaves[keep], priorities[keep]
         self.tree.put(leaves, priorities)
         self.max_priority = float(priorities.max(initial=self.max_priority))
+
+    def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """All state but the frames: arrays, some of them views, and numbers that JSON can hold.
+
+        They are for `restore`. A view shows later changes: write it, or copy it, before the next call.
+        """
+        arrays = {name: getattr(self, name) for name in _ARRAYS} | {"priorities": self.tree.leaves}
+        numbers = {name: getattr(self, name) for name in _NUMBERS} | {"rng": self.rng.bit_generator.state}
+        return arrays, numbers
+
+    def restore(self, arrays: Mapping[str, np.ndarray], numbers: Mapping[str, Any]) -> None:
+        """Takes over the state of a `snapshot`; whatever is done next then has the same results to the bit.
+
+        Args:
+            arrays, numbers: from a replay that was made with the same arguments. Its frames are already in
+                `frames`.
+
+        Raises:
+            ValueError: something is missing, has another shape or dtype, or contradicts the rest, in one
+                line; nothing is changed then.
+        """
+        rng = self._check_snapshot(arrays, numbers)
+        for name in _ARRAYS:
+            getattr(self, name)[...] = arrays[name]
+        for name in _NUMBERS:
+            setattr(self, name, numbers[name])
+        self.tree.fill(arrays["priorities"])
+        self.rng = rng
+
+    def changed_slots(self, since: np.ndarray) -> np.ndarray:
+        """Which slots, bool [L], had a frame written in any stream since an earlier moment.
+
+        Args:
+            since: int64 [N], a copy of `next_position` of that moment; zeros for the very start.
+
+        Raises:
+            ValueError: this replay was never there.
+        """
+        since = _check("since", since, self.next_position.shape, np.int64)
+        if (since < 0).any() or (since > self.next_position).any():
+            raise ValueError(f"since must lie in [0, {self.next_position.tolist()}], got {since.tolist()}")
+        laps_behind = (np.arange(self.slots) - since[:, None]) % self.slots
+        return (laps_behind < (self.next_position - since)[:, None]).any(axis=0)
+
+    def filled_slots(self) -> int:
+        """How many slots, from the first on, have ever been written in any stream."""
+        return min(int(self.next_position.max()), self.slots)
+
+    def _check_snapshot(self, arrays, numbers):
+        """The generator of a snapshot, if everything in it is a state that a replay like this can be in."""
+        own_arrays, own_numbers = self.snapshot()
+        for what, given, own in (("arrays", arrays, own_arrays), ("numbers", numbers, own_numbers)):
+            if not isinstance(given, Mapping) or given.keys() != own.keys():
+                raise ValueError(f"replay snapshot: the {what} must be {', '.join(own)}")
+        for name, own in own_arrays.items():
+            array = arrays[name]
+            if not isinstance(array, np.ndarray) or (array.shape, array.dtype) != (own.shape, own.dtype):
+                raise ValueError(f"replay snapshot: {name} must be {own.dtype} {own.shape}")
+        for name in _NUMBERS:
+            if type(numbers[name]) is not type(own_numbers[name]):
+                raise ValueError(f"replay snapshot: {name} must be a {type(own_numbers[name]).__name__}")
+        rng = np.random.default_rng(0)
+        try:
+            rng.bit_generator.state = numbers["rng"]
+            known_rng = rng.bit_generator.state == numbers["rng"]
+        except Exception:  # numpy's checks raise many kinds
+            known_rng = False
+
+        stored, start, active = arrays["next_position"], arrays["episode_start"], arrays["active"]
+        newest = stored[:, None] - 1
+        positions = newest - (newest - np.arange(self.slots)) % self.slots
+        intact = positions >= np.maximum(newest - self.slots + self.stack, 0)
+        known = positions <= newest - np.where(active, self.horizon, 1)[:, None]
+        of_newest_episode = positions >= start[:, None]
+        priorities, most = arrays["priorities"], numbers["max_priority"]
+        can = priorities.reshape(positions.shape) > 0
+        most_steps = max(int(stored.min()) - 1, 0)
+        for holds, message in (
+            (known_rng, f"rng must be a state of {own_numbers['rng']['bit_generator']}"),
+            ((arrays["flags"] <= _ENDED | _TERMINAL).all(), "flags has unknown bits"),
+            ((arrays["age"] < self.stack).all(), f"age must be below {self.stack}"),
+            # Far below 2 ** 63, so that no position or index to come overflows.
+            (((stored >= 0) & (stored < 2**48)).all(), "next_position is out of range"),
+            (not active[stored == 0].any(), "active before anything is stored"),
+            # An episode that is over has two observations.
+            (
+                ((start >= 0) & (start <= np.maximum(stored - 2 + active, 0))).all(),
+                "episode_start is out of range",
+            ),
+            (
+                numbers["num_transitions"] in range(0, self.num_streams * most_steps + 1, self.num_streams),
+                "num_transitions is out of range",
+            ),
+            (1 <= most and most * priorities.size < np.inf, "max_priority is out of range"),
+            (((priorities >= 0) & (priorities <= most)).all(), "priorities must lie in [0, max_priority]"),
+            (numbers["num_sampleable"] == np.count_nonzero(can), "num_sampleable is not that of priorities"),
+            (
+                (can <= intact).all() and (can == (intact & known))[of_newest_episode].all(),
+                "priorities are not those of transitions that can be sampled",
+            ),
+        ):
+            if not holds:
+                raise ValueError(f"replay snapshot: {message}")
+        return rng
 
     def _flat(self, array):
         """A view of [N, L, ...] as [N * L, ...], so that leaves index it."""

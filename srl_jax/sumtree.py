@@ -79,6 +79,15 @@ class SumTree:
         blocks = indices >> _SHIFT
         self._sums[blocks] = np.add.reduce(self._blocks.take(blocks, axis=0), axis=1)
 
+    def fill(self, values: np.ndarray) -> None:
+        """Writes all leaves; every sum comes out to the bit as if they had been `set` one by one.
+
+        Args:
+            values: float64 [capacity], finite and not negative, which is not checked.
+        """
+        self._blocks.reshape(-1)[: self.capacity] = values
+        np.add.reduce(self._blocks, axis=1, out=self._sums)
+
     def find(self, prefix_sums: np.ndarray) -> np.ndarray:
         """The leaf in which each prefix sum falls: leaf i covers [sum before i, sum up to i).
 

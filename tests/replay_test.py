@@ -1,154 +1,22 @@
 """srl_jax/replay.py against lists of whole episodes, and numbers worked by hand."""
 
-import itertools
+import json
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments.soaking.replay_reference import (
+    EVENTS,
+    RESET,
+    STEP,
+    TERMINATED,
+    TRUNCATED,
+    Driver,
+    same_state,
+)
 from srl_jax.replay import Replay
-
-GAMMA = 0.5  # powers of it are exact
-STEP, TERMINATED, TRUNCATED, LIFE_LOST, BOTH, LIFE_AND_TRUNCATED, RESET = range(7)
-
-
-class Episode:
-    """Every observation of an episode, and the step (action, reward, is_terminal) after each."""
-
-    def __init__(self, start, frame):
-        self.start, self.frames, self.steps, self.over = start, [frame], [], False
-
-
-class Reference:
-    """What a replay should hold: keeps everything for ever, looks everything up slowly."""
-
-    def __init__(self, num_streams, slots, stack, horizon):
-        self.slots, self.stack, self.horizon = slots, stack, horizon
-        self.episodes = [[] for _ in range(num_streams)]
-
-    def observations(self, stream):
-        return sum(len(episode.frames) for episode in self.episodes[stream])
-
-    def begin(self, stream, frame):
-        if self.episodes[stream]:
-            self.episodes[stream][-1].over = True
-        self.episodes[stream].append(Episode(self.observations(stream), frame))
-
-    def add(self, stream, action, reward, is_terminal, over, frame):
-        episode = self.episodes[stream][-1]
-        episode.steps.append((action, reward, is_terminal))
-        episode.frames.append(frame)
-        episode.over = over
-
-    def sampleable(self):
-        """{index: (episode, t)}."""
-        result = {}
-        for stream, episodes in enumerate(self.episodes):
-            oldest = self.observations(stream) - 1 - self.slots + self.stack
-            for episode in episodes:
-                for t in range(len(episode.steps)):
-                    known = episode.over or t + self.horizon <= len(episode.steps)
-                    if known and episode.start + t >= oldest:
-                        index = (episode.start + t) * len(self.episodes) + stream
-                        result[index] = (episode, t)
-        return result
-
-    def window(self, episode, t):
-        last = len(episode.frames) - 1
-        frames = [
-            episode.frames[min(max(t - self.stack + 1 + i, 0), last)]
-            for i in range(self.stack + self.horizon)
-        ]
-        rows = []
-        for k in range(self.horizon):
-            if t + k < len(episode.steps):
-                action, reward, is_terminal = episode.steps[t + k]
-                rows.append((action, reward, 0.0 if is_terminal else GAMMA, 1.0))
-            else:
-                rows.append((0, 0.0, 0.0, 0.0))
-        return np.stack(frames), *(np.array(column) for column in zip(*rows, strict=True))
-
-    def n_step(self, episode, t, n):
-        """(the return up to there, the factor of the bootstrap value, the observation it is of)."""
-        total, factor = 0.0, 1.0
-        for k in range(n):
-            if t + k == len(episode.steps):
-                return total, factor, self.observation(episode, t + k)
-            _, reward, is_terminal = episode.steps[t + k]
-            total += factor * reward
-            if is_terminal:
-                return total, 0.0, None
-            factor *= GAMMA
-        return total, factor, self.observation(episode, t + n)
-
-    def observation(self, episode, t):
-        return np.stack([episode.frames[max(t - i, 0)] for i in range(self.stack - 1, -1, -1)])
-
-
-class Driver:
-    """Sends the same experience to a Replay and to the Reference; no two frames are alike."""
-
-    def __init__(self, *, num_streams=1, slots=12, stack=2, horizon=1, alpha=0.5, spare=0, seed=0):
-        self.replay = Replay(
-            capacity=num_streams * slots + spare,
-            num_streams=num_streams,
-            frame_shape=(2, 2),
-            stack=stack,
-            horizon=horizon,
-            gamma=GAMMA,
-            alpha=alpha,
-            seed=seed,
-        )
-        self.reference = Reference(num_streams, slots, stack, horizon)
-        self.waiting = set(range(num_streams))
-        self.count = itertools.count(1)
-
-    def new_frames(self, n):
-        ids = np.array([next(self.count) for _ in range(n)], np.uint32)
-        return ids.view(np.uint8).reshape(n, 2, 2).copy()
-
-    def step(self, events):
-        """One step of every stream, after `begin` for those that wait for it or are to be reset."""
-        events = np.array(events)
-        streams = sorted(self.waiting | set(np.flatnonzero(events == RESET).tolist()))
-        if streams:
-            frames = self.new_frames(len(streams))
-            everyone = len(streams) == len(events)
-            self.replay.begin(frames, None if everyone else np.array(streams))
-            for stream, frame in zip(streams, frames, strict=True):
-                self.reference.begin(stream, frame.copy())
-        frames = self.new_frames(len(events))
-        numbers = frames.reshape(-1, 4).copy().view(np.uint32)[:, 0].astype(np.int64)
-        terminated = np.isin(events, [TERMINATED, BOTH])
-        truncated = np.isin(events, [TRUNCATED, BOTH, LIFE_AND_TRUNCATED])
-        life_lost = np.isin(events, [LIFE_LOST, LIFE_AND_TRUNCATED])
-        actions, rewards = numbers % 18, (numbers % 7 - 3).astype(np.float32)
-        self.replay.add(actions, rewards, terminated, truncated, life_lost, frames)
-        over = terminated | truncated
-        for i in range(len(events)):
-            is_terminal = bool(terminated[i] or life_lost[i])
-            frame = frames[i].copy()
-            self.reference.add(i, actions[i], rewards[i], is_terminal, bool(over[i]), frame)
-        self.waiting = set(np.flatnonzero(over).tolist())
-        frames[:] = 255  # the caller may reuse its buffer
-
-    def check_indices(self):
-        expected = self.reference.sampleable()
-        assert sorted(self.replay.sampleable().tolist()) == sorted(expected)
-        assert len(self.replay) == len(expected)
-        return expected
-
-    def check_windows(self):
-        expected = self.check_indices()
-        window = self.replay.gather(np.array(list(expected), np.int64))
-        for row, (episode, t) in enumerate(expected.values()):
-            frames, actions, rewards, discounts, valid = self.reference.window(episode, t)
-            np.testing.assert_array_equal(window.frames[row], frames)
-            np.testing.assert_array_equal(window.actions[row], actions)
-            np.testing.assert_array_equal(window.rewards[row], rewards)
-            np.testing.assert_array_equal(window.discounts[row], discounts)
-            np.testing.assert_array_equal(window.valid[row], valid)
 
 
 @st.composite
@@ -164,7 +32,7 @@ def experience(draw):
         horizon=horizon,
         spare=draw(st.integers(0, num_streams - 1)),
     )
-    event = st.sampled_from([STEP] * draw(st.integers(1, 8)) + list(range(7)))
+    event = st.sampled_from([STEP] * draw(st.integers(1, 8)) + list(EVENTS))
     row = st.lists(event, min_size=num_streams, max_size=num_streams)
     length = draw(st.integers(1, 3 * slots))
     return driver, draw(st.lists(row, min_size=length, max_size=length))
@@ -211,6 +79,219 @@ def test_a_sample_is_made_of_sampleable_windows(case, batch_size):
         assert set(indices.tolist()) <= set(driver.reference.sampleable())
         for drawn, gathered in zip(window[:-1], driver.replay.gather(indices)[:-1], strict=True):
             np.testing.assert_array_equal(drawn, gathered)
+
+
+@given(experience(), st.integers(0, 2**32 - 1))
+@settings(deadline=None, max_examples=60)
+def test_a_restored_replay_goes_on_bit_for_bit(case, seed):
+    driver, events = case
+    rng = np.random.default_rng(seed)
+    for row in events:
+        if rng.random() < 0.2:
+            driver.restore()  # compares all state; from here on both have to give the same results
+        driver.step(row)
+        if len(driver.replay):
+            indices = driver.sample(3, 0.4)
+            driver.set_priorities(indices, rng.normal(size=3).tolist())
+        driver.check()
+    driver.restore()
+    driver.check_windows()
+
+
+def test_a_snapshot_survives_json_to_the_bit():
+    driver = filled(seed=2**31 + 5)
+    driver.replay.set_priorities(driver.replay.sample(3, 0.4)[1], np.array([1 / 3, 1e300, 0.1]))
+    _, numbers = driver.replay.snapshot()
+    assert numbers["rng"]["state"]["inc"] > 2**64  # beyond what a float holds, or an int64
+    assert json.loads(json.dumps(numbers)) == numbers
+
+
+def test_a_restored_replay_keeps_its_own_arrays():
+    replay = filled().replay
+    arrays, numbers = replay.snapshot()
+    copy = Driver().replay
+    copy.frames[:] = replay.frames
+    copy.restore(arrays, numbers)
+    copy.add(*step_of_one())
+    copy.sample(4, 0.4)
+    same_state(filled().replay, replay)
+
+
+def step_of_one():
+    return (np.zeros(1, int), np.zeros(1), *np.zeros((3, 1), bool), np.zeros((1, 2, 2), np.uint8))
+
+
+def wrong(name, index, value):
+    """A change of one element of an array of a snapshot."""
+
+    def change(arrays, numbers):
+        arrays[name] = arrays[name].copy()
+        arrays[name].reshape(-1)[index] = value
+
+    return change
+
+
+def instead(name, value, part=0):
+    """A change of a whole array (part 0) or a number (part 1) of a snapshot."""
+    return lambda *snapshot: snapshot[part].__setitem__(name, value)
+
+
+def wrong_rng(**changes):
+    def change(arrays, numbers):
+        numbers["rng"] = numbers["rng"] | changes
+
+    return change
+
+
+# 2 streams of 12 slots, stack 3, horizon 2, after 21 observations: positions 9 .. 20 are there, and 11 .. 18
+# can be sampled, in slots 11, 0, 1, ... 6.
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda arrays, numbers: arrays.pop("age"), "arrays must be actions"),
+        (lambda arrays, numbers: numbers.pop("rng"), "numbers must be max_priority"),
+        (instead("frames", np.zeros(3)), "arrays must be"),
+        (instead("__class__", 1, 1), "numbers must be"),
+        (instead("actions", np.zeros((2, 12), np.int64)), r"actions must be int32 \(2, 12\)"),
+        (instead("rewards", np.zeros((2, 12), ">f4")), "rewards must be float32"),
+        (instead("flags", np.zeros((12, 2), np.uint8)), "flags must be"),
+        (instead("active", [True, True]), "active must be"),
+        (instead("priorities", np.full(24, None)), "priorities must be float64"),
+        (instead("priorities", np.zeros(23)), "priorities must be"),
+        (wrong("flags", 5, 4), "flags has unknown bits"),
+        (wrong("age", 5, 3), "age must be below 3"),
+        (wrong("next_position", 0, -1), "next_position is out of range"),
+        (wrong("next_position", 1, np.iinfo(np.int64).max), "next_position is out of range"),
+        (wrong("next_position", 1, np.iinfo(np.int64).min), "next_position is out of range"),
+        (wrong("next_position", 1, 22), "not those of transitions that can be sampled"),
+        (wrong("next_position", 1, 0), "active before anything is stored"),
+        (wrong("episode_start", 0, -1), "episode_start is out of range"),
+        (wrong("episode_start", 0, 21), "episode_start is out of range"),
+        (wrong("active", 0, False), "not those of transitions that can be sampled"),
+        (wrong("priorities", 0, -1.0), "priorities must lie in"),
+        (wrong("priorities", 0, np.nan), "priorities must lie in"),
+        (wrong("priorities", 0, np.inf), "priorities must lie in"),
+        (wrong("priorities", 0, 5.0), "priorities must lie in"),  # above the maximum
+        (wrong("priorities", 0, 0.0), "num_sampleable"),
+        (wrong("priorities", [0, 7], [0.0, 1.0]), "not those of transitions that can be sampled"),
+        (wrong("priorities", [0, 10], [0.0, 1.0]), "not those of transitions that can be sampled"),
+        (instead("num_sampleable", 15, 1), "num_sampleable"),
+        (instead("num_sampleable", 16.0, 1), "num_sampleable must be a int"),
+        (instead("num_sampleable", True, 1), "num_sampleable must be a int"),
+        (instead("num_transitions", 41, 1), "num_transitions"),
+        (instead("num_transitions", 42, 1), "num_transitions"),
+        (instead("num_transitions", -2, 1), "num_transitions"),
+        (instead("max_priority", 1, 1), "max_priority must be a float"),
+        (instead("max_priority", 0.5, 1), "max_priority is out of range"),
+        (instead("max_priority", float("nan"), 1), "max_priority is out of range"),
+        (instead("max_priority", 1e308, 1), "max_priority is out of range"),  # sums would overflow
+        (instead("rng", None, 1), "rng must be a state of PCG64"),
+        (instead("rng", [1, 2], 1), "rng must be a state of PCG64"),
+        (instead("rng", np.random.Generator(np.random.MT19937(0)).bit_generator.state, 1), "PCG64"),
+        (wrong_rng(bit_generator="PCG64DXSM"), "rng must be a state of PCG64"),
+        (wrong_rng(state={"state": 1}), "rng must be a state of PCG64"),
+        (wrong_rng(state={"state": 2**128, "inc": 1}), "rng must be a state of PCG64"),
+        (wrong_rng(state={"state": -1, "inc": 1}), "rng must be a state of PCG64"),
+        (wrong_rng(state={"state": "1", "inc": 1}), "rng must be a state of PCG64"),
+        (wrong_rng(uinteger=2**32), "rng must be a state of PCG64"),
+        (wrong_rng(more=1), "rng must be a state of PCG64"),
+    ],
+)
+def test_a_bad_snapshot_is_refused_in_one_line_and_changes_nothing(change, message):
+    options = {"num_streams": 2, "stack": 3, "horizon": 2}
+    source, target = filled(20, **options).replay, Driver(**options).replay
+    assert np.flatnonzero(source.tree.leaves[:12]).tolist() == [0, 1, 2, 3, 4, 5, 6, 11]
+    arrays, numbers = source.snapshot()
+    change(arrays, numbers)
+    with pytest.raises(ValueError, match=message) as error:
+        target.restore(arrays, numbers)
+    assert "\n" not in str(error.value)
+    same_state(target, Driver(**options).replay)
+
+
+VALUES = (0, 1, 2, 3, 5, 255, 1e-300, 1e300, -1, np.inf, np.nan, 2**31 - 1, 2**47, 2**63 - 1)
+
+
+@given(experience(), st.data())
+@settings(deadline=None, max_examples=60)
+def test_whatever_is_restored_can_be_gone_on_with(case, data):
+    # A snapshot made up by somebody who knows the checks: refused, or nothing goes wrong afterwards.
+    driver, events = case
+    for row in events:
+        driver.step(row)
+    arrays, numbers = driver.replay.snapshot()
+    for _ in range(data.draw(st.integers(1, 4))):
+        name = data.draw(st.sampled_from(list(arrays)))
+        index = data.draw(st.integers(0, arrays[name].size - 1))
+        with np.errstate(all="ignore"):
+            value = np.array(data.draw(st.sampled_from(VALUES))).astype(arrays[name].dtype)
+        wrong(name, index, value)(arrays, numbers)
+    numbers["max_priority"] = data.draw(st.sampled_from([1.0, 1e300, 1e306]))
+    numbers["num_sampleable"] = int(np.count_nonzero(arrays["priorities"] > 0))
+    replay = Replay(**driver.options)
+    try:
+        replay.restore(arrays, numbers)
+    except ValueError as error:
+        assert "\n" not in str(error)
+        return
+    n = replay.num_streams
+    zeros = np.zeros(n)
+    for i in range(2 * replay.slots):
+        if len(replay):
+            window, indices = replay.sample(4, 0.4)
+            assert np.isfinite(window.weight).all()
+            assert (indices >= 0).all()
+            replay.set_priorities(indices[:1], np.ones(1))
+        if not replay.active.all():
+            waiting = np.flatnonzero(~replay.active)
+            replay.begin(np.zeros((len(waiting), 2, 2), np.uint8), waiting)
+        over = zeros.astype(bool) if i % 5 else ~zeros.astype(bool)
+        replay.add(zeros.astype(int), zeros, over, over, over, np.zeros((n, 2, 2), np.uint8))
+        assert len(replay) == len(replay.sampleable()) == np.count_nonzero(replay.tree.leaves)
+
+
+@given(experience(), st.data())
+@settings(deadline=None, max_examples=60)
+def test_changed_slots_are_those_whose_frames_differ(case, data):
+    driver, events = case
+    moment = data.draw(st.integers(0, len(events) - 1))
+    start = driver.replay.next_position.copy()
+    for i, row in enumerate(events):
+        if i == moment:
+            since, before = driver.replay.next_position.copy(), driver.replay.frames.copy()
+        driver.step(row)
+    frames = driver.replay.frames
+    # No two frames are alike, and none is 0.
+    changed = (frames != before).any(axis=(0, 2, 3))
+    np.testing.assert_array_equal(driver.replay.changed_slots(since), changed)
+    ever = frames.any(axis=(0, 2, 3))
+    np.testing.assert_array_equal(driver.replay.changed_slots(start), ever)
+    assert ever.tolist() == [i < driver.replay.filled_slots() for i in range(driver.replay.slots)]
+
+
+@pytest.mark.parametrize(
+    ("before", "after", "slots"),
+    [
+        (0, 3, [0, 1, 2, 3]),  # steps; there is an observation more, the first
+        (3, 3, []),
+        (9, 12, [0, 10, 11]),  # around the end
+        (9, 20, [*range(12)][:9] + [10, 11]),  # eleven of twelve
+        (9, 21, [*range(12)]),
+        (9, 30, [*range(12)]),
+    ],
+)
+def test_changed_slots_by_hand(before, after, slots):
+    driver = filled(before)
+    since = driver.replay.next_position.copy()
+    for _ in range(after - before):
+        driver.step([STEP])
+    assert np.flatnonzero(driver.replay.changed_slots(since)).tolist() == slots
+
+
+@pytest.mark.parametrize("since", [[-1, 0], [0, 5], [0], [0.0, 0.0]])
+def test_changed_slots_since_a_moment_that_never_was(since):
+    with pytest.raises(ValueError, match="since must"):
+        filled(3, num_streams=2).replay.changed_slots(np.array(since))
 
 
 def filled(steps=30, **options):

@@ -66,12 +66,29 @@ def test_total_does_not_drift():
 def test_leaves_are_the_whole_state(case):
     # A checkpoint keeps the leaves alone; the draws after it must not differ by a bit.
     tree, leaves = case
-    copy = SumTree(len(leaves))
-    copy.set(np.arange(len(leaves)), leaves)
-    assert copy.total == tree.total
-    if tree.total:
-        prefix = np.minimum(np.cumsum(leaves), tree.total)
-        np.testing.assert_array_equal(copy.find(prefix), tree.find(prefix))
+    one_by_one, at_once = SumTree(len(leaves)), SumTree(len(leaves))
+    one_by_one.set(np.arange(len(leaves)), leaves)
+    at_once.set(np.arange(len(leaves)), 1.0)
+    at_once.fill(leaves)
+    for copy in (one_by_one, at_once):
+        assert copy._sums.tobytes() == tree._sums.tobytes()
+        assert copy.leaves.tobytes() == tree.leaves.tobytes()
+        assert copy.total == tree.total
+        if tree.total:
+            prefix = np.minimum(np.cumsum(leaves), tree.total)
+            np.testing.assert_array_equal(copy.find(prefix), tree.find(prefix))
+
+
+def test_sums_of_many_blocks_are_those_of_their_leaves_alone():
+    # As many as a long run has: however many rows numpy adds up at once, each in the same order.
+    rng = np.random.default_rng(0)
+    leaves = rng.random(100_000) * 10.0 ** rng.integers(-9, 9, 100_000)
+    written, filled = SumTree(100_000), SumTree(100_000)
+    for part in np.array_split(rng.permutation(100_000), 700):
+        written.set(part, leaves[part])
+    filled.fill(leaves)
+    assert written._sums.tobytes() == filled._sums.tobytes()
+    assert filled.leaves.tobytes() == leaves.tobytes()
 
 
 def test_stratified_counts_follow_the_values():
