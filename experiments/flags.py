@@ -215,19 +215,24 @@ def parse(argv: list[str], values: flags.FlagValues = flags.FLAGS) -> list[str]:
     return rest
 
 
-def run(main: Callable[[list[str]], Any]) -> None:
-    """Runs an entry point: parses the flags and turns what `srl_jax.errors` has into a line and a status.
+def guarded(main: Callable[[list[str]], Any]) -> Callable[[list[str]], Any]:
+    """The function, ending the process with a line and a status where it raises what `srl_jax.errors` has."""
 
-    Args:
-        main: takes [the program's name]; may return the exit status.
-    """
-
-    def guarded(argv: list[str]) -> Any:
+    def call(argv: list[str]) -> Any:
         try:
             return main(argv)
         except tuple(EXIT_STATUS) as error:
             fail(error, next(n for kind, n in EXIT_STATUS.items() if isinstance(error, kind)))
 
+    return call
+
+
+def run(main: Callable[[list[str]], Any]) -> None:
+    """Runs an entry point: parses the flags, and ends with a line and a status where it fails; see `guarded`.
+
+    Args:
+        main: takes [the program's name]; may return the exit status.
+    """
     # absl prints what libraries log, and jax logs every accelerator that it does not find.
     logging.getLogger("jax").setLevel(logging.WARNING)
-    app.run(guarded, flags_parser=parse)
+    app.run(guarded(main), flags_parser=parse)

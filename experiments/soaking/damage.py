@@ -1,7 +1,7 @@
 """A checkpoint of a real run, damaged in every way that a disk knows: all must be noticed, by name.
 
-A bit flipped at random positions (half of them drawn by file, half by byte, so that small files are not spared),
-each file cut short, made longer, removed, and replaced by a link or by another file of the checkpoint.
+A bit flipped at random positions (half of them drawn by file, half by byte, so that small files are not
+spared), each file cut short, made longer, removed, and replaced by a link or by another file.
 """
 
 import random
@@ -104,7 +104,7 @@ class Checks:
         try:
             checkpoint.verify(checkpoint.read_manifest(self._folder))
         except ConfigError as error:
-            # A manifest that does not fit its sum may be either's fault; and one that is missing is no manifest.
+            # A manifest that does not fit its sum may be either's fault.
             names = [path.name] if path.name not in _ABOUT else [*_ABOUT, str(self._folder)]
             self._missed += not any(name in str(error) for name in names) or "\n" in str(error)
         else:

@@ -1,9 +1,9 @@
 """Runs that are killed with SIGKILL, again and again, against the same run left alone.
 
 Half of the kills come after a random time, the others at a random operation of writing a checkpoint: before,
-within and after a file, before and after flushing and renaming. What the resumed run is in the end (parameters,
-optimizer, replay with priorities, generators, environments, metrics but for wall time) must be what the other
-one is, bit for bit.
+within and after a file, before and after flushing and renaming. What the resumed run is in the end
+(parameters, optimizer, replay with priorities, generators, environments, metrics but for wall time) must be
+what the other one is, bit for bit.
 """
 
 import json
@@ -23,8 +23,8 @@ from srl_jax.metrics import read_metrics, strip_wall
 ROOT = Path(__file__).resolve().parents[2]
 
 SMALL = (
-    "--encoder=tiny:features=16", "--rl=rainbow:hidden=32,atoms=11", "--mode=joint", "--objective=reconstruction",
-    "--num_envs=4", "--buffer_size=1000", "--batch_size=8", "--updates_per_step=0.1", "--learn_start=80",
+    "--encoder=tiny:features=16", "--rl=rainbow:hidden=32,atoms=11", "--mode=joint",
+    "--objective=reconstruction", "--num_envs=4", "--buffer_size=1000", "--batch_size=8", "--updates_per_step=0.1", "--learn_start=80",
     "--steps=2400", "--log_every=200", "--eval_every=600", "--eval_games=2", "--eval_max_steps=150",
     "--checkpoint_every=140", "--slow_update_every=20", "--tune_runtime=off",
 )  # fmt: skip

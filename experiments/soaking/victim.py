@@ -2,7 +2,7 @@
 
 It is `experiments.train` with the given flags, and says "begun" on stdout when training begins. When the run
 has ended it writes DIGEST, a JSON object of sums of everything that the run is. FAULT is the number of the
-operation of writing checkpoints at which it kills itself, or -1; the operation's name is left in DIGEST.fault.
+operation of writing checkpoints at which it kills itself, or -1; its name is left in DIGEST.fault.
 """
 
 import hashlib
@@ -124,4 +124,4 @@ def main(arguments: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(config_flags.guarded(main)(sys.argv[1:]))
