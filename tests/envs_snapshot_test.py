@@ -6,92 +6,18 @@ from gymnasium.error import ResetNeeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from experiments.soaking.snapshots import MOMENTS, Player, goes_on, same
 from srl_jax import envs
 
 RESET = 255
 """An unseeded reset among the events of Atari's snapshots."""
 
 
-class Player:
-    """Random actions, ended environments reset in the next move, and now and then some others.
-
-    Attributes:
-        env, rng: what it moves, and by what.
-        others: the probability of a reset of others.
-        ended: bool [N], these wait for a reset.
-        was_reset: whether the last move was one.
-    """
-
-    def __init__(self, env, rng, ended, others):
-        self.env, self.rng, self.ended, self.others, self.was_reset = env, rng, ended, others, True
-
-    @classmethod
-    def start(cls, env, seed, others=0.1):
-        env.reset()
-        return cls(env, np.random.default_rng(seed), np.zeros(env.num_envs, bool), others)
-
-    def beside(self, env):
-        """One that will do in another environment what this one will do."""
-        rng = np.random.default_rng()
-        rng.bit_generator.state = self.rng.bit_generator.state
-        return type(self)(env, rng, self.ended.copy(), self.others)
-
-    def move(self):
-        """Everything that one step or reset returned."""
-        number = self.env.num_envs
-        self.was_reset = bool(self.ended.any() or self.rng.random() < self.others)
-        if self.was_reset:
-            mask = self.ended | (self.rng.random(number) < 0.5)
-            frames, info = self.env.reset(options={"reset_mask": mask})
-            self.ended = np.zeros(number, bool)
-            return [frames, *info.values()]
-        frames, rewards, terminated, truncated, info = self.env.step(
-            self.rng.integers(0, self.env.single_action_space.n, number)
-        )
-        self.ended = terminated | truncated
-        return [frames, rewards, terminated, truncated, *info.values()]
-
-    def moves(self, number):
-        return [array for _ in range(number) for array in self.move()]
-
-    def until(self, moment):
-        """Moves until the moment has come; the arrays of the last move."""
-        arrays = self.move()
-        while not moment(self):
-            arrays = self.move()
-        return arrays
-
-
-MOMENTS = {
-    "after a step": lambda player: not player.was_reset and not player.ended.any(),
-    "after a reset": lambda player: player.was_reset,
-    "after an end": lambda player: player.ended.any(),
-}
-
-
-def same(a, b):
-    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
-
-
-def identical(a, b):
-    return sorted(a) == sorted(b) and all(a[n].dtype == b[n].dtype and same([a[n]], [b[n]]) for n in a)
-
-
 def check(make, player, moment, moves):
-    """Snapshot at the moment, restore, and go on beside the original; the snapshot."""
-    last = player.until(MOMENTS[moment])
-    snapshot = player.env.snapshot()
-    kept = {name: array.copy() for name, array in snapshot.items()}
-    for array in snapshot.values():
-        array.setflags(write=False)
-    env = make()
-    np.testing.assert_array_equal(env.restore(snapshot), last[0])
-    assert identical(env.snapshot(), kept)
-    other = player.beside(env)
-    assert same(player.moves(moves), other.moves(moves))
-    assert identical(player.env.snapshot(), env.snapshot())
-    assert identical(snapshot, kept)
-    return kept
+    """The snapshot of the moment, once a new environment went on from it as the old one did."""
+    difference, snapshot = goes_on(player, make, player.until(moment), moves)
+    assert not difference
+    return snapshot
 
 
 @pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
