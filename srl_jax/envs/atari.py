@@ -3,10 +3,12 @@
 Bellemare et al., 2013; Machado et al., 2018.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from srl_jax.envs.base import FrameVectorEnv
+from srl_jax.envs.base import Form, FrameVectorEnv
 from srl_jax.envs.games import rom_name
 
 try:
@@ -16,6 +18,10 @@ except ImportError as error:
 
 FRAME_SKIP = 4
 """Emulator frames per env step."""
+COUNTERS = ("lives", "frame_number", "episode_frame_number")
+"""What ALE says of an environment beside its frame, int32 each."""
+RESET = 255
+"""Stands for an unseeded reset among the actions of a log."""
 
 
 class Atari(FrameVectorEnv):
@@ -30,8 +36,12 @@ class Atari(FrameVectorEnv):
     for an unseeded one, so an environment gets a seeded reset only when at least `reseed_every` env
     steps have passed since its last one. In between, an episode depends on everything since that
     reset, because the emulator's random numbers go on and some games remember the past. The whole
-    is a function of the seed, the actions and the masks all the same. To resume exactly, replay
-    actions and resets from the last seeded reset, whose seed is in `ale_seeds`.
+    is a function of the seed, the actions and the masks all the same.
+
+    Snapshots. ALE's own saved states are not exact: they lose the last action, which sticky actions
+    repeat, and some of what Qbert and YarsRevenge remember. So every environment keeps a log of
+    actions and unseeded resets since its last seeded reset, a byte each, and `restore` plays it
+    again; that takes as long as playing it took, up to `reseed_every` steps and an episode.
 
     ALE's own quirk: an episode that ends within the four frames keeps the last frames that were
     captured before the end, so its final frame may equal the one before.
@@ -126,6 +136,10 @@ class Atari(FrameVectorEnv):
         self._seeded_resets = np.zeros(num_envs, np.int64)
         self.ale_seeds = np.full(num_envs, -1, np.int64)
         self.steps_since_seeded = np.zeros(num_envs, np.int64)
+        self._log = np.zeros((num_envs, 256), np.uint8)  # grows
+        self._log_lengths = np.zeros(num_envs, np.int64)
+        self._log_longest = 0  # at least the largest of them
+        self._rows = np.arange(num_envs)
 
     def _reset(self, mask, seeded):
         if seeded:
@@ -133,19 +147,20 @@ class Atari(FrameVectorEnv):
         first = self._seeded_resets == 0
         due = mask & (first | (self.steps_since_seeded >= self._reseed_every))
         for i in np.flatnonzero(due):
-            (word,) = self._stream(i, int(self._seeded_resets[i])).generate_state(1)
-            # ALE wants a positive int32; -1 stands for an unseeded reset.
-            self.ale_seeds[i] = max(1, int(word) & 0x7FFFFFFF)
+            self.ale_seeds[i] = self._ale_seed(i, int(self._seeded_resets[i]))
         self._seeded_resets[due] += 1
         self.steps_since_seeded[due] = 0
-        seeds = np.where(due, self.ale_seeds, -1)[mask]
-        frames, info = self._envs.reset(seed=seeds, options={"reset_mask": mask})
+        frames, info = self._reset_ale(mask, np.where(due, self.ale_seeds, -1))
         self._lives = np.array(info["lives"])
+        self._log_lengths[due] = 0
+        self._log_longest = int(self._log_lengths.max())
+        self._append(np.flatnonzero(mask & ~due), RESET)
         return frames[:, 0].copy(), self._info(info, np.zeros(self.num_envs, bool))
 
     def _step(self, actions):
         frames, rewards, terminated, truncated, info = self._envs.step(actions)
         self.steps_since_seeded += 1
+        self._append(self._rows, actions)
         life_lost = info["lives"] < self._lives
         self._lives = np.array(info["lives"])
         return (
@@ -156,10 +171,122 @@ class Atari(FrameVectorEnv):
             self._info(info, life_lost),
         )
 
+    def _ale_seed(self, env, number):
+        """The seed of an environment's seeded reset of that number, counted from 0."""
+        (word,) = self._stream(env, number).generate_state(1)
+        return max(1, int(word) & 0x7FFFFFFF)  # ALE wants a positive int32
+
+    def _reset_ale(self, mask, seeds):
+        """Resets the environments of the mask, bool [N]; seeds are int64 [N], -1 for an unseeded reset."""
+        return self._envs.reset(seed=seeds[mask], options={"reset_mask": mask})
+
+    def _append(self, envs, events):
+        """Adds one event each to the logs of the environments envs, int64 [M]."""
+        if self._log_longest == self._log.shape[1]:
+            self._log = np.concatenate((self._log, np.zeros_like(self._log)), axis=1)
+        self._log[envs, self._log_lengths[envs]] = events
+        self._log_lengths[envs] += 1
+        self._log_longest += 1
+
     def _info(self, info, life_lost):
-        names = ("lives", "frame_number", "episode_frame_number")
-        return {"life_lost": life_lost} | {name: np.array(info[name]) for name in names}
+        return {"life_lost": life_lost} | {name: np.array(info[name]) for name in COUNTERS}
+
+    def _look(self):
+        """Frames and info as they were last seen: resets nothing."""
+        return self._reset_ale(np.zeros(self.num_envs, bool), self.ale_seeds)
+
+    def _seen(self):
+        return self._look()[0][:, 0].copy()
+
+    def _forms(self):
+        number = (self.num_envs,)
+        return {
+            "ale_seeds": Form(np.int64, number, 1, 2**31 - 1),
+            "seeded_resets": Form(np.int64, number, 1),
+            "steps_since_seeded": Form(np.int64, number, 0),
+            "events": Form(np.uint8, (None,)),
+            "event_counts": Form(np.int64, number, 0),
+        } | {name: Form(np.int32, number, 0) for name in COUNTERS}
+
+    def _snapshot(self):
+        info = self._look()[1]
+        written = np.arange(self._log.shape[1]) < self._log_lengths[:, None]
+        return {
+            "ale_seeds": self.ale_seeds.copy(),
+            "seeded_resets": self._seeded_resets.copy(),
+            "steps_since_seeded": self.steps_since_seeded.copy(),
+            "events": self._log[written],
+            "event_counts": self._log_lengths.copy(),
+        } | {name: np.array(info[name]) for name in COUNTERS}
+
+    def _check_snapshot(self, arrays):
+        events, counts = arrays["events"], arrays["event_counts"]
+        if sum(counts.tolist()) != len(events):
+            raise ValueError(
+                f"event_counts of the snapshot add up to {counts.sum()}, events are {len(events)}"
+            )
+        unknown = (events >= self.single_action_space.n) & (events != RESET)
+        if unknown.any():
+            raise ValueError(f"events of the snapshot are no actions of the game: {events[unknown][0]}")
+        steps = [int((log != RESET).sum()) for log in logs_of(arrays)]
+        resets = arrays["seeded_resets"].tolist()
+        seeds = [self._ale_seed(i, number - 1) for i, number in enumerate(resets)]
+        for name, expected in (("steps_since_seeded", steps), ("ale_seeds", seeds)):
+            if arrays[name].tolist() != expected:
+                raise ValueError(f"{name} of the snapshot must be {expected}, got {arrays[name].tolist()}")
+
+    def _restore(self, arrays):
+        logs = logs_of(arrays)
+        self.ale_seeds = arrays["ale_seeds"].copy()
+        self._seeded_resets = arrays["seeded_resets"].copy()
+        self.steps_since_seeded = arrays["steps_since_seeded"].copy()
+        self._log_lengths = arrays["event_counts"].copy()
+        self._log_longest = int(self._log_lengths.max())
+        self._log = np.zeros((self.num_envs, 256 + self._log_longest), np.uint8)
+        for row, log in zip(self._log, logs, strict=True):
+            row[: len(log)] = log
+        ended = self._replay(logs)
+        info = self._look()[1]
+        self._lives = np.array(info["lives"])
+        return {"ended": ended} | {name: info[name] for name in COUNTERS}
+
+    def _replay(self, logs):
+        """Plays the logs, uint8 arrays, each from a seeded reset on; says who has ended then, bool [N].
+
+        ALE steps all environments together, so the logs are aligned at their ends: an environment whose
+        log is shorter plays anything until its seeded reset, which forgets it.
+        """
+        ticks = int(self.steps_since_seeded.max())
+        starts = ticks - self.steps_since_seeded
+        actions = np.zeros((ticks, self.num_envs), np.int64)
+        resets = np.zeros((ticks + 1, self.num_envs), np.int64)  # unseeded ones, before that tick
+        for i, log in enumerate(logs):
+            steps = log != RESET
+            actions[starts[i] :, i] = log[steps]
+            np.add.at(resets[:, i], starts[i] + np.cumsum(steps)[~steps], 1)
+        ended = np.zeros(self.num_envs, bool)
+        unseeded = np.full(self.num_envs, -1, np.int64)
+        # All at once, since ALE wants a first reset of all.
+        self._reset_ale(np.ones(self.num_envs, bool), np.where(starts == 0, self.ale_seeds, -1))
+        for tick in range(ticks + 1):
+            if tick:
+                _, _, terminated, truncated, _ = self._envs.step(actions[tick - 1])
+                ended = terminated | truncated
+                starting = starts == tick
+                if starting.any():
+                    self._reset_ale(starting, self.ale_seeds)
+                    ended &= ~starting
+            for number in range(resets[tick].max()):
+                again = resets[tick] > number
+                self._reset_ale(again, unseeded)
+                ended &= ~again
+        return ended
 
     def close_extras(self, **kwargs):
         """Ends ALE's threads."""
         self._envs = None
+
+
+def logs_of(arrays: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """The log of each environment, uint8, from the arrays of a snapshot."""
+    return np.split(arrays["events"], np.cumsum(arrays["event_counts"])[:-1])

@@ -9,9 +9,11 @@ The game is in the spirit of the Catch of bsuite (Osband et al., 2020), with vel
 single frame does not show.
 """
 
+from collections.abc import Mapping
+
 import numpy as np
 
-from srl_jax.envs.base import FrameVectorEnv
+from srl_jax.envs.base import Form, FrameVectorEnv
 
 GRID = 84
 """The game is played on an integer grid of GRID x GRID, whatever the size of the frames."""
@@ -124,6 +126,42 @@ class Catch(FrameVectorEnv):
         rewards = np.where(landed, np.where(caught, 1, -1), 0).astype(np.float32)
         return self._frames(), rewards, landed, np.zeros(self.num_envs, bool), self._info()
 
+    def _forms(self):
+        integers = {
+            "ball_x": (BALL_LEFT, BALL_RIGHT),
+            "ball_y": (BALL_RADIUS, LAST_ROW),
+            "drift": (-MAX_DRIFT, MAX_DRIFT),
+            "fall": (int(DROPS[:, 0].min()), int(DROPS[:, 0].max())),
+            "paddle": (PADDLE_LEFT, PADDLE_RIGHT),
+            "episodes": (1, None),
+        }
+        forms = {name: Form(np.int64, (self.num_envs,), *limits) for name, limits in integers.items()}
+        return forms | ({} if self._background is None else self._background.forms())
+
+    def _snapshot(self):
+        arrays = {
+            "ball_x": self._ball_x,
+            "ball_y": self._ball_y,
+            "drift": self._drift,
+            "fall": self._fall,
+            "paddle": self._paddle,
+            "episodes": self._episodes,
+        }
+        if self._background is not None:
+            arrays |= self._background.arrays()
+        return {name: array.copy() for name, array in arrays.items()}
+
+    def _restore(self, arrays):
+        self._ball_x, self._ball_y = arrays["ball_x"].copy(), arrays["ball_y"].copy()
+        self._drift, self._fall = arrays["drift"].copy(), arrays["fall"].copy()
+        self._paddle, self._episodes = arrays["paddle"].copy(), arrays["episodes"].copy()
+        if self._background is not None:
+            self._background.restore(arrays)
+        return {"ended": self._ball_y >= LAST_ROW}
+
+    def _seen(self):
+        return self._frames()
+
     def _info(self):
         state = (self._ball_x, self._ball_y, self._drift, self._fall, self._paddle)
         return {
@@ -187,6 +225,29 @@ class Background:
         # Never zero, so that both layers always move.
         speed = rng.integers(1, MAX_SCROLL + 1, size=(2, 2))
         self._velocity[i] = speed * rng.choice((-1, 1), size=(2, 2))
+
+    def forms(self) -> dict[str, Form]:
+        """What `arrays` gives."""
+        number = len(self._time)
+        return {
+            "background_time": Form(np.int64, (number,), 0),
+            "background_offset": Form(np.int64, (number, 2, 2), 0, TORUS - 1),
+            "background_velocity": Form(np.int64, (number, 2, 2), -MAX_SCROLL, MAX_SCROLL),
+        }
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """The state by name, not copied."""
+        return {
+            "background_time": self._time,
+            "background_offset": self._offset,
+            "background_velocity": self._velocity,
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray]):
+        """Takes over the state from copies of such arrays."""
+        self._time = arrays["background_time"].copy()
+        self._offset = arrays["background_offset"].copy()
+        self._velocity = arrays["background_velocity"].copy()
 
     def draw(self) -> np.ndarray:
         """The frames, uint8 [N, H, W]."""
