@@ -24,7 +24,8 @@ ROOT = Path(__file__).resolve().parents[2]
 
 SMALL = (
     "--encoder=tiny:features=16", "--rl=rainbow:hidden=32,atoms=11", "--mode=joint",
-    "--objective=reconstruction", "--num_envs=4", "--buffer_size=1000", "--batch_size=8", "--updates_per_step=0.1", "--learn_start=80",
+    "--objective=reconstruction",
+    "--num_envs=4", "--buffer_size=1000", "--batch_size=8", "--updates_per_step=0.1", "--learn_start=80",
     "--steps=2400", "--log_every=200", "--eval_every=600", "--eval_games=2", "--eval_max_steps=150",
     "--checkpoint_every=140", "--slow_update_every=20", "--tune_runtime=off",
 )  # fmt: skip
