@@ -17,6 +17,7 @@ import numpy as np
 from srl_jax.sumtree import SumTree
 from srl_jax.types import Window
 
+_ALL = slice(None)  # streams
 _ENDED = 1  # the next observation is the episode's last one
 _TERMINAL = 2  # the discount of this step is 0
 
@@ -191,9 +192,9 @@ class Replay:
         leaves = self._leaf(self._streams, self.next_position - 1)
         self._flat(self.actions)[leaves] = actions
         self._flat(self.rewards)[leaves] = rewards
-        self._flat(self.flags)[leaves] = _ENDED * ended + _TERMINAL * (terminated | life_lost)
-        self._store(self._streams, frames)
-        self._update_tree(self._streams, ended, self._steps_back)
+        self._flat(self.flags)[leaves] = ended + (terminated | life_lost).view(np.uint8) * _TERMINAL
+        self._store(_ALL, frames)
+        self._update_tree(_ALL, ended, self._steps_back)
         self.active &= ~ended
         self.num_transitions += self.num_streams
 
@@ -388,10 +389,10 @@ class Replay:
         return leaves, (positions > newest - self.slots) & (positions <= newest) & (self.tree.get(leaves) > 0)
 
     def _store(self, streams, frames):
-        """Stores the next observations: frame and age."""
+        """Stores the next observations, of int [M] streams or of a slice: frame and age."""
         positions = self.next_position[streams]
         steps = positions - self.episode_start[streams]
-        leaves = self._leaf(streams, positions)
+        leaves = self._leaf(self._streams[streams], positions)
         self._flat(self.frames)[leaves] = frames
         self._flat(self.age)[leaves] = np.minimum(steps, self.stack - 1)
         self.next_position[streams] += 1
@@ -402,23 +403,23 @@ class Replay:
         Where it is its episode's last one (ended, bool [M]), every slot of the episode among those
         `steps_back`, int [J], is complete, else only the one `horizon` steps back.
         """
-        newest = self.next_position.take(streams) - 1
+        newest, start = self.next_position[streams] - 1, self.episode_start[streams]
+        base = self._streams[streams] * self.slots
+        # Slots from newest - slots + 1 on are intact; the first stack - 1 of them may lack frames.
+        oldest = newest - (self.slots - self.stack + 1)
+        closed = (base + oldest % self.slots)[oldest >= 0]
         if ended.any():
             positions = newest[:, None] - steps_back
             opens = ended[:, None] | (steps_back == self.horizon)
-            opens &= positions >= self.episode_start[streams, None]
-            leaves_opened = self._leaf(streams[:, None], positions)[opens]
+            opens &= positions >= start[:, None]
+            opened = (base[:, None] + positions % self.slots)[opens]
         else:
             positions = newest - self.horizon
-            leaves_opened = self._leaf(streams, positions)[positions >= self.episode_start.take(streams)]
-        # Slots from newest - slots + 1 on are intact; the first stack - 1 of them may lack frames.
-        oldest = newest - self.slots + self.stack - 1
-        leaves_closed = self._leaf(streams, oldest)[oldest >= 0]
-        num_closed = int(np.count_nonzero(self.tree.get(leaves_closed)))
-        self.num_sampleable += len(leaves_opened) - num_closed
-        values = np.zeros(len(leaves_closed) + len(leaves_opened))
-        values[len(leaves_closed) :] = self.max_priority
-        self.tree.put(np.concatenate((leaves_closed, leaves_opened)), values)
+            opened = (base + positions % self.slots)[positions >= start]
+        self.num_sampleable += len(opened) - int(np.count_nonzero(self.tree.get(closed)))
+        values = np.zeros(len(closed) + len(opened))
+        values[len(closed) :] = self.max_priority
+        self.tree.put(np.concatenate((closed, opened)), values)
 
     def _window(self, streams, positions, weight):
         """The Window of sampleable positions: see types.Window."""
