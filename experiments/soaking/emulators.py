@@ -342,13 +342,13 @@ def through_the_loop(short: bool, folder: Path, say: Say) -> list[Count]:
 
     Actions are random, and no update is made, but every step a batch is sampled and given random priorities.
     Episodes are cut after 500 steps, so that there are many ends of both kinds, and environments reseeded
-    after 2,500. Windows are compared with the record: those of every batch, and all that can be sampled, so
+    as often. Windows are compared with the record: those of every batch, and all that can be sampled, so
     often that every transition is among them before it is overwritten.
     """
     games, total = (TEN_GAMES[:3], 600) if short else (TEN_GAMES, 100_000)
-    episode, capacity, number = (20, 90, 3) if short else (500, 10_000, 10)
+    episode, reseed, capacity, number = (20, 100, 90, 3) if short else (500, 500, 10_000, 10)
     steps = total // number
-    options = {"max_frames": 4 * episode, "reseed_every": 5 * episode}
+    options = {"max_frames": 4 * episode, "reseed_every": reseed}
     counts: Counter[str] = Counter()
     with Progress(len(games) * total, stream=Lines(say)) as progress:
         for index, game in enumerate(games):

@@ -221,10 +221,9 @@ class Atari(FrameVectorEnv):
 
     def _check_snapshot(self, arrays):
         events, counts = arrays["events"], arrays["event_counts"]
-        if sum(counts.tolist()) != len(events):
-            raise ValueError(
-                f"event_counts of the snapshot add up to {counts.sum()}, events are {len(events)}"
-            )
+        total = sum(counts.tolist())  # int64 might overflow
+        if total != len(events):
+            raise ValueError(f"event_counts of the snapshot add up to {total}, events are {len(events)}")
         unknown = (events >= self.single_action_space.n) & (events != RESET)
         if unknown.any():
             raise ValueError(f"events of the snapshot are no actions of the game: {events[unknown][0]}")
