@@ -13,16 +13,18 @@ executes nothing: msgpack, JSON and npy are data; an npy header is not parsed bu
 be. The module imports no jax until parameters are read or written.
 """
 
+import contextlib
 import hashlib
 import io
 import json
+import math
 import os
 import re
 import shutil
 import stat
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -32,6 +34,7 @@ from srl_jax.errors import ConfigError, SaveError
 MANIFEST, CHECKSUM, PARAMS, NUMBERS = "manifest.json", "manifest.sha256", "params.msgpack", "run.json"
 FORMAT = 2
 _NAME = re.compile(r"[a-z0-9_]+\.(msgpack|npy|json)")
+_DTYPES = frozenset(np.dtype(code).str for code in "?bhiqBHIQefd")  # of numbers, as numpy writes them
 _PIECE = 1 << 24  # bytes that are written, or read to be summed, at a time
 
 
@@ -97,9 +100,10 @@ def save(
     keep: int = 2,
     folder: str = "checkpoints",
 ) -> Manifest:
-    """Writes `run/checkpoints/ENV_STEPS` and removes all but the newest `keep`.
+    """Writes `run/checkpoints/ENV_STEPS` and removes those before it, but for the newest.
 
-    One of the same step is replaced. A save that fails leaves the others as they are.
+    One of the same step is replaced. A save that fails leaves the others as they are. Newer ones stay, too: a
+    run leaves them behind where they are damaged.
 
     Args:
         run: the run directory.
@@ -107,7 +111,7 @@ def save(
         config, num_actions, env_steps, updates: see `Manifest`.
         state: what else is needed to go on; None where nobody will.
         base: the run's last checkpoint, whose files stand in for `state.unchanged`.
-        keep: how many checkpoints stay; 0 for all.
+        keep: how many checkpoints stay, up to this one; 0 for all.
         folder: the name of the directory that holds them.
 
     Returns:
@@ -130,7 +134,8 @@ def save(
         about["config"] = json.loads(config.to_json())
         sign(temporary, about)
         _put_in_place(temporary, final)
-        for old in _all(home)[:-keep] if keep else ():
+        up_to_this = [p for p in _all(home) if p.name <= final.name]
+        for old in up_to_this[:-keep] if keep else ():
             aside = home / f".{old.name}.old.partial"
             os.replace(old, aside)  # so that nobody takes one that is half removed for a checkpoint
             shutil.rmtree(aside)
@@ -178,7 +183,12 @@ def _put_in_place(temporary: Path, final: Path) -> None:
     _flush(temporary)
     if final.exists():
         os.replace(final, aside)
-    os.replace(temporary, final)
+    try:
+        os.replace(temporary, final)
+    except OSError:
+        if aside.exists():
+            os.replace(aside, final)
+        raise
     _flush(final.parent)
     shutil.rmtree(aside, ignore_errors=True)
 
@@ -187,7 +197,7 @@ def slim(manifest: Manifest) -> Manifest:
     """Rewrites a checkpoint from which nobody will go on: what `State` brought in is removed.
 
     Raises:
-        SaveError: it could not be written; the checkpoint is as it was.
+        SaveError: it could not be written; the checkpoint is whole, as it was or slim.
     """
     final = manifest.path
     temporary = final.parent / f".{final.name}.partial"
@@ -230,7 +240,7 @@ def write(path: Path, pieces: list) -> Entry:
 
 def write_array(path: Path, array: np.ndarray) -> Entry:
     """Writes an npy file, flushed to disk."""
-    array = np.ascontiguousarray(array)
+    array = np.asarray(array, order="C")
     pieces = [_header(array.dtype, array.shape)] + ([array.reshape(-1)] if array.size else [])
     return write(path, pieces)._replace(dtype=array.dtype.str, shape=array.shape)
 
@@ -255,19 +265,14 @@ def read_manifest(path: str | Path) -> Manifest:
     Raises:
         ConfigError: there is none, or it is damaged; one line.
     """
-    path = Path(path)
+    path = given = Path(path)
     for folder in (path / "checkpoints", path):
         if not _there(path / MANIFEST) and _there(folder) and _all(folder):
             path = _all(folder)[-1]
-    try:
-        data = _bytes(path / MANIFEST)
-        written = _bytes(path / CHECKSUM)
-    except ConfigError as error:
-        if _there(path / MANIFEST):
-            raise
-        raise ConfigError(
-            f"{path}: no checkpoint there; name a run directory or one of its checkpoints"
-        ) from error
+    if path == given and not any(_there(path / name) for name in (MANIFEST, CHECKSUM)):
+        raise ConfigError(f"{path}: no checkpoint there; name a run directory or one of its checkpoints")
+    data = _bytes(path / MANIFEST)
+    written = _bytes(path / CHECKSUM)
     if written != f"{hashlib.sha256(data).hexdigest()}  {MANIFEST}\n".encode():
         raise ConfigError(f"{path / MANIFEST}: damaged: its sha256 is not the one in {CHECKSUM}")
     try:
@@ -287,7 +292,7 @@ def read_manifest(path: str | Path) -> Manifest:
         raise ConfigError(f"{path / MANIFEST}: damaged ({_line(error)})") from None
     try:
         return Manifest(path, Config.from_json(config), *numbers, files)
-    except ConfigError as error:
+    except (ConfigError, OverflowError) as error:
         raise ConfigError(f"{path / MANIFEST}: {error}") from None
 
 
@@ -404,10 +409,9 @@ def load_array(manifest: Manifest, name: str, into: np.ndarray | None = None) ->
     if entry is None:
         raise ConfigError(f"{manifest.path}: no {file} in this checkpoint")
     try:
-        dtype = np.dtype(entry.dtype)
-        plain = dtype.kind in "biuf" and dtype.str == entry.dtype
-        if not plain or not all(type(n) is int and n >= 0 for n in entry.shape):
+        if entry.dtype not in _DTYPES or not all(type(n) is int and n >= 0 for n in entry.shape):
             raise ValueError(f"dtype {entry.dtype} and shape {entry.shape} are not an array's")
+        dtype = np.dtype(entry.dtype)
         if into is not None and (into.dtype != dtype or into.shape != entry.shape):
             raise ValueError(f"{dtype} {entry.shape}, not {into.dtype} {into.shape}")
         header = _header(dtype, entry.shape)
@@ -434,7 +438,7 @@ def load_numbers(manifest: Manifest) -> dict[str, Any]:
     """
     path, data = _checked(manifest, NUMBERS)
     try:
-        numbers = json.loads(data)
+        numbers = json.loads(data, parse_constant=_finite, parse_float=_finite)
     except (ValueError, RecursionError) as error:
         raise ConfigError(f"{path}: damaged ({_line(error)})") from None
     if type(numbers) is not dict:
@@ -455,23 +459,25 @@ def _checked(manifest: Manifest, file: str) -> tuple[Path, bytes]:
 def _bytes(path: Path, size: int = 1 << 24) -> bytes:
     """A file's content; of one that is larger than `size`, a byte more than that."""
     with _opened(path) as file:
-        return file.read(size + 1)
+        return file.read(min(size, os.fstat(file.fileno()).st_size) + 1)
 
 
-def _opened(path: Path):
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[BinaryIO]:
     """The file, for reading bytes, if it is a plain one: not a link, a pipe or a device.
 
     Raises:
-        ConfigError: it is not, or cannot be opened.
+        ConfigError: it is not, or cannot be opened, or read.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             os.close(descriptor)
             raise ConfigError(f"{path}: not a plain file")
+        with open(descriptor, "rb", buffering=0) as file:
+            yield file
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    return open(descriptor, "rb", buffering=0)
 
 
 def _there(path: Path) -> bool:
@@ -480,6 +486,17 @@ def _there(path: Path) -> bool:
         return os.path.lexists(path)
     except ValueError:
         return False
+
+
+def _finite(text: str) -> float:
+    """A number of a JSON text.
+
+    Raises:
+        ValueError: it is none that JSON has, or too large for a float.
+    """
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is not a finite number")
+    return number
 
 
 def _line(error: Exception) -> str:
@@ -507,21 +524,26 @@ def load_into(template: Any, tree: Any, what: str) -> Any:
         odd = sorted(set(expected) ^ set(found))[0]
         raise ConfigError(f"{what}: parameters do not fit: {odd} is on one side only")
     for name, x in expected.items():
-        shape, dtype = getattr(found[name], "shape", None), getattr(found[name], "dtype", None)
-        if x.shape != shape or x.dtype != dtype:
-            raise ConfigError(f"{what}: parameter {name} is {dtype} {shape}, not {x.dtype} {x.shape}")
+        (dtype, shape), (right_dtype, right_shape) = _form(found[name]), _form(x)
+        if (dtype, shape) != (right_dtype, right_shape):
+            raise ConfigError(f"{what}: parameter {name} is {dtype} {shape}, not {right_dtype} {right_shape}")
     restored = serialization.from_state_dict(template, tree)
     return jax.tree.unflatten(jax.tree.structure(template), jax.tree.leaves(restored))
 
 
 def _flat(tree: Any, path: str = "") -> dict[str, Any]:
-    """{path: leaf} of nested dicts, as ['encoder']['kernel']."""
-    if not isinstance(tree, dict):
+    """{path: leaf} of nested dicts, as ['encoder']['kernel']; an empty dict is a leaf."""
+    if not isinstance(tree, dict) or not tree:
         return {path: tree}
     leaves = {}
     for name, branch in tree.items():
         leaves |= _flat(branch, f"{path}[{name!r}]")
     return leaves
+
+
+def _form(leaf: Any) -> tuple:
+    """Dtype and shape; of what is no array its type, and None."""
+    return (leaf.dtype, leaf.shape) if hasattr(leaf, "shape") else (type(leaf).__name__, None)
 
 
 def check_sources(config: Config) -> None:

@@ -68,9 +68,10 @@ def test_linear_schedule_by_hand():
 
 def test_random_policy_is_uniform_and_repeats_with_its_seed():
     frames = np.zeros((1000, 1, 1, 1), np.uint8)
-    actions = random_policy(4, 7)(frames, 0, 0.0)
+    drawn = lambda seed: random_policy(4, np.random.default_rng(seed))  # noqa: E731
+    actions = drawn(7)(frames, 0, 0.0)
     assert actions.dtype == np.int32
     counts = np.bincount(actions, minlength=4)
     assert len(counts) == 4 and counts.min() > 200  # 250 expected, standard deviation 14
-    np.testing.assert_array_equal(actions, random_policy(4, 7)(frames, 9, 1.0))
-    assert not np.array_equal(actions, random_policy(4, 8)(frames, 0, 0.0))
+    np.testing.assert_array_equal(actions, drawn(7)(frames, 9, 1.0))
+    assert not np.array_equal(actions, drawn(8)(frames, 0, 0.0))

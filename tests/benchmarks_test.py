@@ -276,6 +276,48 @@ def test_every_row_names_what_there_is():
         assert all(SIDES[side].twin in ("", *chosen) for side in chosen)
 
 
+# The loop, as the workers run it
+
+
+@pytest.fixture
+def tiny(monkeypatch):
+    """A run that compiles quickly, in place of every preset."""
+    from experiments.benchmarks import jax_side
+    from srl_jax import loop
+    from srl_jax.config import Config
+
+    config = Config(
+        game="Catch", frame_size=42, encoder="tiny:features=8", rl="rainbow:hidden=8,atoms=5", num_envs=4,
+        buffer_size=400, batch_size=8, learn_start=40, updates_per_step=0.25, steps=1000, eval_every=100,
+        eval_games=2,
+    )  # fmt: skip
+    monkeypatch.setattr(jax_side, "config_of", lambda preset: config)
+    monkeypatch.setattr(loop, "act_and_step", loop.act_and_step)  # the worker's own goes with the test
+    return config
+
+
+def test_the_timed_loop_does_the_updates_that_are_due(tiny):
+    from experiments.benchmarks.host_side import WARM_UPDATES, Loop
+
+    timed = Loop()
+    timed.setup("any")
+    assert timed._run.updates == WARM_UPDATES
+    reply = timed.run(60)
+    assert (reply["env_steps"], reply["updates"]) == (60, 15) and reply["seconds"] > 0
+    parts = timed.parts(3)
+    assert [len(parts[name]) for name in ("iteration", "acting", "update", "busy")] == [3, 3, 3, 1]
+    assert timed._run.report.means.take() == {}  # nothing is kept from one request to the next
+    timed._run.env_thread.shutdown()
+
+
+def test_a_projected_run_has_the_evaluations_of_a_whole_one(tiny, monkeypatch):
+    from experiments.benchmarks import gpu
+
+    found = gpu.whole_run(0.05)
+    minutes = (1000 / found["env_steps_per_s"] + 11 * found["evaluation_s"]) / 60
+    assert found["minutes"] == pytest.approx(minutes) and found["evaluation_s"] > 0
+
+
 # The command line
 
 

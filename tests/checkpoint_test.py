@@ -1,10 +1,16 @@
 """srl_jax/checkpoint.py: what is written comes back bit by bit, or not at all."""
 
+import contextlib
 import dataclasses
+import errno
 import hashlib
+import io
+import itertools
 import json
+import os
 import pickle
 import shutil
+import signal
 
 import msgpack
 import numpy as np
@@ -14,7 +20,7 @@ from hypothesis import strategies as st
 
 from srl_jax import checkpoint
 from srl_jax.config import Config
-from srl_jax.errors import ConfigError
+from srl_jax.errors import ConfigError, SaveError
 from tests.helpers import identical
 
 CONFIG = Config(game="Catch", frame_size=42, encoder="tiny:features=8", seed=5, lr_rl=1 / 3)
@@ -35,14 +41,71 @@ def write(run, params=None, config=CONFIG, env_steps=1000, **options):
     return checkpoint.save(run, make_params() if params is None else params, config, **counts, **options)
 
 
+ARRAYS = {
+    "scalar": np.array(1 / 3),
+    "empty": np.zeros((0, 3), np.int32),
+    "flags": np.array([True, False, True]),
+    "strided": np.arange(24, dtype=np.int64).reshape(4, 6)[:, ::2],
+    "transposed": np.arange(6, dtype=np.float32).reshape(2, 3).T,
+    "odd": np.array([np.nan, -np.inf, -0.0, 5e-324]),
+    "frames": np.random.default_rng(0).integers(0, 256, (2, 3, 4), np.uint8),
+}
+NUMBERS = {"third": 1 / 3, "large": 2**100, "text": "ä", "list": [1, None, True]}
+
+
+def make_state(arrays=ARRAYS, unchanged=()):
+    trees = {"learner": {"step": np.int32(3), "moments": [np.ones(2, np.float32), {}]}}
+    return checkpoint.State(trees, arrays, NUMBERS, frozenset(unchanged))
+
+
 def same_bits(a, b):
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def resign(folder, change):
+    """Changes a manifest and makes its sum fit again, as somebody with a purpose would."""
+    about = json.loads((folder / "manifest.json").read_text())
+    checkpoint.sign(folder, change(about))
+
+
+def replace(folder, file, data):
+    """Puts other data in place of a file, with a manifest that says so."""
+    (folder / file).write_bytes(data)
+    entry = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
+    resign(folder, lambda m: m | {"files": m["files"] | {file: m["files"].get(file, {}) | entry}})
+
+
+def whole(path):
+    """The manifest, if every file is what it says."""
+    manifest = checkpoint.read_manifest(path)
+    checkpoint.verify(manifest)
+    return manifest
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+@contextlib.contextmanager
+def in_time(seconds=20):
+    """Fails, rather than wait for ever."""
+
+    def late(*_):
+        raise AssertionError("it hangs")
+
+    old = signal.signal(signal.SIGALRM, late)
+    signal.alarm(seconds)
+    try:
+        yield
+    finally:
+        signal.alarm(0)
+        signal.signal(signal.SIGALRM, old)
 
 
 @pytest.mark.parametrize("where", ["run", "checkpoints", "checkpoint"])
 def test_round_trip_is_bit_identical(tmp_path, where):
     params = make_params()
-    final = write(tmp_path, params)
+    final = write(tmp_path, params).path
     path = {"run": tmp_path, "checkpoints": tmp_path / "checkpoints", "checkpoint": final}[where]
     manifest = checkpoint.read_manifest(path)
     assert manifest.path == final
@@ -55,11 +118,21 @@ def test_round_trip_is_bit_identical(tmp_path, where):
     assert loaded["heads"]["latent_l2"] == {}
 
 
+def test_what_save_returns_is_what_is_read(tmp_path):
+    assert write(tmp_path, state=make_state()) == whole(tmp_path)
+
+
 def test_the_same_parameters_make_the_same_bytes(tmp_path):
-    first, second = write(tmp_path / "a"), write(tmp_path / "b")
-    assert [p.name for p in sorted(first.iterdir())] == ["manifest.json", "params.msgpack"]
+    first, second = write(tmp_path / "a").path, write(tmp_path / "b").path
+    assert names(first) == ["manifest.json", "manifest.sha256", "params.msgpack"]
     for path in first.iterdir():
         assert path.read_bytes() == (second / path.name).read_bytes()
+
+
+def test_the_sum_is_one_that_sha256sum_checks(tmp_path):
+    folder = write(tmp_path).path
+    digest = hashlib.sha256((folder / "manifest.json").read_bytes()).hexdigest()
+    assert (folder / "manifest.sha256").read_text() == f"{digest}  manifest.json\n"
 
 
 def test_nothing_is_pickled(tmp_path, monkeypatch):
@@ -68,20 +141,93 @@ def test_nothing_is_pickled(tmp_path, monkeypatch):
 
     for name in ("dump", "dumps", "load", "loads", "Pickler", "Unpickler"):
         monkeypatch.setattr(pickle, name, refuse)
-    final = write(tmp_path)
-    assert identical(checkpoint.load(checkpoint.read_manifest(final))["heads"], make_params()["heads"])
+    manifest = whole(write(tmp_path, state=make_state()).path)
+    assert identical(checkpoint.load(manifest)["heads"], make_params()["heads"])
+    for name, array in ARRAYS.items():
+        assert same_bits(checkpoint.load_array(manifest, name), array)
+
+
+@pytest.mark.parametrize("name", ARRAYS)
+def test_arrays_come_back_bit_by_bit_and_as_numpy_reads_them(tmp_path, name):
+    array = ARRAYS[name]
+    manifest = write(tmp_path, state=make_state({name: array}))
+    assert same_bits(checkpoint.load_array(manifest, name), array)
+    assert same_bits(np.load(manifest.path / f"{name}.npy", allow_pickle=False), array)
+    into = np.empty(array.shape, array.dtype)
+    assert checkpoint.load_array(manifest, name, into) is into and same_bits(into, array)
+    for other in (np.empty((*array.shape, 1), array.dtype), np.empty(array.shape, "S3")):
+        with pytest.raises(ConfigError, match=f"{name}.npy: damaged"):
+            checkpoint.load_array(manifest, name, other)
+
+
+def test_trees_and_numbers_come_back(tmp_path):
+    manifest = write(tmp_path, state=make_state())
+    tree = checkpoint.load_tree(manifest, "learner")
+    assert same_bits(tree["step"], np.array(np.int32(3))) and tree["moments"]["1"] == {}
+    assert same_bits(tree["moments"]["0"], np.ones(2, np.float32))
+    assert checkpoint.load_numbers(manifest) == NUMBERS
+
+
+def test_an_unchanged_array_is_a_hard_link_and_a_changed_one_is_not(tmp_path):
+    first = write(tmp_path, state=make_state())
+    flags = ~ARRAYS["flags"]
+    # Nobody reads an array that is said to be unchanged, so here it would be noticed.
+    arrays = ARRAYS | {"flags": flags, "frames": np.zeros_like(ARRAYS["frames"])}
+    second = write(tmp_path, state=make_state(arrays, ["frames"]), base=first, env_steps=2000)
+    inode = lambda manifest, name: (manifest.path / f"{name}.npy").stat().st_ino  # noqa: E731
+    assert inode(first, "frames") == inode(second, "frames")
+    assert inode(first, "flags") != inode(second, "flags")
+    assert same_bits(checkpoint.load_array(whole(second.path), "frames"), ARRAYS["frames"])
+    assert same_bits(checkpoint.load_array(second, "flags"), flags)
+    # It outlives the checkpoint that it came from.
+    shutil.rmtree(first.path)
+    assert same_bits(checkpoint.load_array(whole(second.path), "frames"), ARRAYS["frames"])
+
+
+def test_where_there_is_nothing_to_link_arrays_are_written(tmp_path, monkeypatch):
+    first = write(tmp_path, state=make_state())
+    shutil.rmtree(first.path)
+    second = write(tmp_path, state=make_state(unchanged=ARRAYS), base=first, env_steps=2000)
+    bare = write(tmp_path, env_steps=3000)
+    third = write(tmp_path, state=make_state(unchanged=ARRAYS), base=bare, env_steps=4000)
+
+    def refuse(*_):
+        raise OSError(errno.EPERM, "no links here")
+
+    monkeypatch.setattr(os, "link", refuse)
+    fourth = write(tmp_path, state=make_state(unchanged=ARRAYS), base=third, env_steps=5000, keep=0)
+    for manifest in (third, fourth):
+        assert whole(manifest.path).files == second.files
+        assert same_bits(checkpoint.load_array(manifest, "frames"), ARRAYS["frames"])
 
 
 def test_the_newest_is_read_and_two_are_kept(tmp_path):
     for env_steps in (900, 1000, 20_000, 300_000):
         write(tmp_path, make_params(env_steps), env_steps=env_steps)
     assert checkpoint.read_manifest(tmp_path).env_steps == 300_000
-    kept = sorted(p.name for p in (tmp_path / "checkpoints").iterdir())
-    assert kept == ["000020000", "000300000"]
+    assert names(tmp_path / "checkpoints") == ["000020000", "000300000"]
     loaded = checkpoint.load(checkpoint.read_manifest(tmp_path))
     assert identical(loaded["heads"], make_params(300_000)["heads"])
     write(tmp_path, env_steps=300_001, keep=1)
-    assert [p.name for p in (tmp_path / "checkpoints").iterdir()] == ["000300001"]
+    assert names(tmp_path / "checkpoints") == ["000300001"]
+
+
+def test_what_was_just_written_is_kept_however_many_are_newer(tmp_path):
+    # Where they are damaged, a run has gone on from before them.
+    for env_steps in (1000, 2000, 3000, 4000):
+        write(tmp_path, env_steps=env_steps, keep=0)
+    assert whole(write(tmp_path, env_steps=1500).path).env_steps == 1500
+    assert names(tmp_path / "checkpoints")[:2] == ["000001000", "000001500"]
+    write(tmp_path, env_steps=1600)
+    assert names(tmp_path / "checkpoints")[:2] == ["000001500", "000001600"]
+
+
+def test_all_are_kept_in_a_folder_of_their_own(tmp_path):
+    for env_steps in (1, 2, 3):
+        write(tmp_path, env_steps=env_steps, keep=0, folder="encoders")
+    assert names(tmp_path) == ["encoders"]
+    assert names(tmp_path / "encoders") == ["000000001", "000000002", "000000003"]
+    assert whole(tmp_path / "encoders" / "000000002").env_steps == 2
 
 
 def test_a_checkpoint_of_the_same_step_is_replaced(tmp_path):
@@ -95,95 +241,403 @@ def test_a_write_that_was_cut_short_is_passed_over_and_cleared(tmp_path):
     write(tmp_path, env_steps=1000)
     folder = tmp_path / "checkpoints"
     shutil.copytree(folder / "000001000", folder / ".000002000.partial")
-    (folder / "000003000").mkdir()  # no manifest
     assert checkpoint.read_manifest(tmp_path).env_steps == 1000
-    write(tmp_path, env_steps=2000)
-    assert checkpoint.read_manifest(tmp_path).env_steps == 2000
-    assert not (folder / ".000002000.partial").exists()
+    write(tmp_path, env_steps=3000)
+    assert names(folder) == ["000001000", "000003000"]
+
+
+def test_slim_leaves_the_parameters(tmp_path):
+    params = make_params()
+    manifest = write(tmp_path, params, state=make_state())
+    slimmed = checkpoint.slim(manifest)
+    assert slimmed == whole(manifest.path)
+    assert names(manifest.path) == ["manifest.json", "manifest.sha256", "params.msgpack"]
+    assert identical(checkpoint.load(slimmed)["heads"], params["heads"])
+    assert slimmed._replace(files={}) == manifest._replace(files={})
+    with pytest.raises(ConfigError, match="no run.json in this checkpoint"):
+        checkpoint.load_numbers(slimmed)
+    with pytest.raises(ConfigError, match="no frames.npy in this checkpoint"):
+        checkpoint.load_array(slimmed, "frames")
+
+
+# Going on from the newest good one
+
+
+def newest_good(run, **options):
+    said = []
+    return checkpoint.newest_good(run, said.append, **options), said
+
+
+def test_the_newest_good_one_is_found(tmp_path):
+    assert newest_good(tmp_path) == (None, [])
+    first, second = (write(tmp_path, state=make_state(), env_steps=n) for n in (1000, 2000))
+    assert newest_good(tmp_path) == (second, [])
+    assert newest_good(tmp_path, at_most=1999) == (first, [])
+    assert newest_good(tmp_path, at_most=999) == (None, [])
+
+
+@pytest.mark.parametrize("damage", ["bit", "file", "manifest", "empty"])
+def test_a_damaged_one_is_told_and_the_one_before_is_taken(tmp_path, damage):
+    first, second = (write(tmp_path, state=make_state(), env_steps=n) for n in (1000, 2000))
+    if damage == "bit":
+        flip(second.path / "frames.npy", 1000)
+    elif damage == "empty":
+        shutil.rmtree(second.path)
+        second.path.mkdir()
+    else:
+        (second.path / {"file": "run.json", "manifest": "manifest.json"}[damage]).unlink()
+    found, (line,) = newest_good(tmp_path)
+    assert found == first
+    assert line.startswith(f"{second.path}") and "\n" not in line
+    assert line.endswith("going on from the one before, 000001000")
+    (first.path / "params.msgpack").unlink()
+    with pytest.raises(ConfigError, match="params.msgpack: .*; there is no other checkpoint"):
+        newest_good(tmp_path)
+
+
+def test_a_run_that_had_ended_does_not_go_on_from_before_a_damaged_end(tmp_path):
+    # The one before its end has parameters alone: going on from it is not possible.
+    before, end = (write(tmp_path, env_steps=n) for n in (1000, 2000))
+    assert newest_good(tmp_path) == (end, [])
+    flip(end.path / "params.msgpack", 77)
+    with pytest.raises(ConfigError, match="params.msgpack: damaged.*cannot be gone on from"):
+        newest_good(tmp_path)
+    assert before == whole(before.path)
+
+
+# Writing that fails
+
+
+class Killed(BaseException):
+    """The end of a process, in the middle of a call."""
+
+
+class Faults:
+    """The system calls of a save; the one of a number fails."""
+
+    def __init__(self, monkeypatch, error):
+        self.error, self.left = error, None
+        for module, name in ((os, "replace"), (os, "mkdir"), (os, "link"), (os, "open"), (shutil, "rmtree")):
+            monkeypatch.setattr(module, name, self.counted(getattr(module, name)))
+        monkeypatch.setattr(os, "fsync", self.counted(lambda descriptor: None))
+        monkeypatch.setattr(checkpoint, "open", self.opened, raising=False)
+
+    def counted(self, call):
+        def counted(*arguments, **options):
+            if self.left is not None:
+                self.left -= 1
+                if self.left == 0:
+                    if options.get("ignore_errors") and self.error is OSError:
+                        return None
+                    raise self.error(errno.ENOSPC, "No space left on device")
+            return call(*arguments, **options)
+
+        return counted
+
+    def opened(self, path, mode, **options):
+        file = self.counted(open)(path, mode, **options)
+        if "w" not in mode:
+            return file
+        write = file.write  # all but the last byte go through
+        failing = self.counted(lambda data: None)
+
+        class Writing(io.BufferedIOBase):
+            def write(_, data):
+                size = len(data)
+                write(data[: size - 1])
+                failing(data)
+                write(data[size - 1 :])
+
+            fileno, flush, close = file.fileno, file.flush, file.close
+
+        return Writing()
+
+
+@pytest.mark.parametrize("error", [OSError, Killed], ids=["fails", "killed"])
+@pytest.mark.parametrize("env_steps", [3000, 2000], ids=["another step", "the same step"])
+def test_a_save_that_ends_anywhere_leaves_the_one_before(tmp_path, monkeypatch, error, env_steps):
+    faults = Faults(monkeypatch, error)
+    for number in itertools.count(1):
+        run = tmp_path / str(number)
+        first = write(run, make_params(1), state=make_state(), env_steps=1000)
+        second = write(run, make_params(2), state=make_state(unchanged=ARRAYS), base=first, env_steps=2000)
+        faults.left = number
+        ended = False
+        try:
+            state = make_state(unchanged=["frames"])
+            write(run, make_params(3), state=state, base=second, env_steps=env_steps)
+        except (SaveError, Killed) as problem:
+            ended = True
+            if isinstance(problem, SaveError):
+                assert "No space left on device" in str(problem) and "\n" not in str(problem)
+        reached, faults.left = faults.left <= 0, None
+        found, said = newest_good(run)
+        heads = checkpoint.load(found)["heads"]
+        new, old = (identical(heads, make_params(n)["heads"]) for n in (3, 2))
+        if env_steps == 3000:
+            assert not said and (new, old) == ((True, False) if found.env_steps == 3000 else (False, True))
+            assert new or ended
+        elif error is OSError:
+            assert found.env_steps == 2000 and (new or (old and ended))
+        else:  # between the two renames neither of the two is there: the one before them is
+            assert (new or old) if found.env_steps == 2000 else found == first and ended
+        last = write(run, make_params(4), state=make_state(unchanged=ARRAYS), base=found, env_steps=4000)
+        assert whole(run) == last and not list((run / "checkpoints").glob(".*"))
+        shutil.rmtree(run)
+        if not reached:
+            assert number > 25
+            return
+
+
+def test_slimming_that_fails_leaves_a_whole_checkpoint(tmp_path, monkeypatch):
+    faults = Faults(monkeypatch, OSError)
+    for number in itertools.count(1):
+        manifest = write(tmp_path / str(number), state=make_state())
+        faults.left = number
+        possible = [{"params.msgpack"}]
+        try:
+            checkpoint.slim(manifest)
+        except SaveError:
+            possible.append(set(manifest.files))
+        reached, faults.left = faults.left <= 0, None
+        assert set(whole(manifest.path).files) in possible
+        if not reached:
+            assert number > 5
+            return
+
+
+# Damage
 
 
 @pytest.fixture(scope="module")
 def written(tmp_path_factory):
-    return write(tmp_path_factory.mktemp("run"))
+    return write(tmp_path_factory.mktemp("run"), state=make_state()).path
 
 
-@given(st.data())
-def test_one_flipped_bit_is_refused(written, tmp_path_factory, data):
-    content = bytearray((written / "params.msgpack").read_bytes())
-    bit = data.draw(st.integers(0, 8 * len(content) - 1))
+@pytest.fixture
+def copy(written, tmp_path):
+    return shutil.copytree(written, tmp_path / "copy")
+
+
+FILES = ["manifest.json", "manifest.sha256", "params.msgpack", "learner.msgpack", "run.json", "frames.npy"]
+
+
+def flip(path, bit):
+    content = bytearray(path.read_bytes())
     content[bit // 8] ^= 1 << bit % 8
-    folder = tmp_path_factory.mktemp("damaged")
-    shutil.copy(written / "manifest.json", folder)
-    (folder / "params.msgpack").write_bytes(content)
-    with pytest.raises(ConfigError, match="damaged") as error:
-        checkpoint.load(checkpoint.read_manifest(folder))
-    assert str(folder / "params.msgpack") in str(error.value)
+    path.write_bytes(content)
+
+
+def check_refused(folder, file):
+    with in_time(), pytest.raises(ConfigError) as error:
+        whole(folder)
+    line = str(error.value)
+    assert str(folder) in line and "\n" not in line
+    # Of the manifest and its sum, neither can say which one it is.
+    assert file in line or (file.startswith("manifest") and "manifest" in line)
 
 
 @given(st.data())
-def test_a_damaged_manifest_is_an_error_of_one_line_or_still_describes_the_file(
-    written, tmp_path_factory, data
-):
-    # It holds no sum of itself: a flipped bit in a number passes. None may be a crash or load other bytes.
-    content = bytearray((written / "manifest.json").read_bytes())
-    for _ in range(data.draw(st.integers(1, 3))):
-        bit = data.draw(st.integers(0, 8 * len(content) - 1))
-        content[bit // 8] ^= 1 << bit % 8
-    folder = tmp_path_factory.mktemp("damaged")
-    shutil.copy(written / "params.msgpack", folder)
-    (folder / "manifest.json").write_bytes(content)
-    try:
-        loaded = checkpoint.load(checkpoint.read_manifest(folder))
-    except ConfigError as error:
-        assert str(folder) in str(error) and "\n" not in str(error)
-    else:
-        assert identical(loaded["heads"], make_params()["heads"])
+def test_one_flipped_bit_in_any_file_is_refused(written, tmp_path_factory, data):
+    folder = shutil.copytree(written, tmp_path_factory.mktemp("damaged") / "copy")
+    file = data.draw(st.sampled_from(names(folder)))
+    flip(folder / file, data.draw(st.integers(0, 8 * (folder / file).stat().st_size - 1)))
+    check_refused(folder, file)
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("size", [0, 1, -1])
+def test_a_file_that_is_cut_short_is_refused(copy, file, size):
+    path = copy / file
+    path.write_bytes(path.read_bytes()[:size])
+    check_refused(copy, file)
+
+
+@pytest.mark.parametrize("file", FILES)
+def test_a_file_with_more_in_it_is_refused(copy, file):
+    with open(copy / file, "ab") as longer:
+        longer.write(b"\n")
+    check_refused(copy, file)
+
+
+@pytest.mark.parametrize("file", FILES)
+@pytest.mark.parametrize("kind", ["missing", "link", "pipe", "directory", "device"])
+def test_a_file_that_is_none_is_refused_by_name_without_waiting(copy, written, file, kind):
+    path = copy / file
+    path.unlink()
+    if kind == "link":
+        path.symlink_to(written / file)  # to what it was: a link is refused all the same
+    elif kind == "pipe":
+        os.mkfifo(path)
+    elif kind == "directory":
+        path.mkdir()
+    elif kind == "device":
+        path.symlink_to("/dev/zero")
+    check_refused(copy, file)
+
+
+def test_a_file_that_cannot_be_read_is_refused(copy, monkeypatch):
+    class Broken(io.RawIOBase):  # as of a disk that fails
+        def fileno(self):
+            return os.open(os.devnull, os.O_RDONLY)
+
+        def readinto(self, buffer):
+            raise OSError(errno.EIO, "Input/output error")
+
+    manifest = whole(copy)
+
+    def opened(descriptor, *arguments, **options):
+        os.close(descriptor)
+        return Broken()
+
+    monkeypatch.setattr(os, "fstat", lambda _: os.stat(copy / "frames.npy"))
+    monkeypatch.setattr(checkpoint, "open", opened, raising=False)
+    for read in (
+        lambda: checkpoint.read_manifest(copy),
+        lambda: checkpoint.verify(manifest._replace(files={"frames.npy": manifest.files["frames.npy"]})),
+        lambda: checkpoint.load_array(manifest, "frames"),
+        lambda: checkpoint.load(manifest),
+    ):
+        with pytest.raises(ConfigError, match="Input/output error"):
+            read()
+
+
+def test_missing_checkpoints_are_named(tmp_path):
+    for path in (tmp_path, tmp_path / "nowhere"):
+        with pytest.raises(ConfigError, match=f"{path}: no checkpoint there"):
+            checkpoint.read_manifest(path)
+    # A directory that should be one is damaged; it is not passed over.
+    write(tmp_path, env_steps=1000)
+    (tmp_path / "checkpoints" / "000002000").mkdir()
+    with pytest.raises(ConfigError, match="000002000"):
+        checkpoint.read_manifest(tmp_path)
+
+
+# Somebody with a purpose: the sums fit
+
+
+def entry(**values):
+    return lambda m: m | {"files": m["files"] | {"frames.npy": m["files"]["frames.npy"] | values}}
+
+
+def file(name):
+    return lambda m: m | {"files": m["files"] | {name: m["files"]["params.msgpack"]}}
 
 
 @pytest.mark.parametrize(
     "change",
     [
         lambda m: [],
-        lambda m: {**m, "format": 2},
+        lambda m: {**m, "format": 1},
+        lambda m: {**m, "format": 3},
         lambda m: {**m, "num_actions": "3"},
+        lambda m: {**m, "env_steps": -1},
+        lambda m: {**m, "updates": True},
         lambda m: {**m, "files": {}},
         lambda m: {**m, "files": ["params.msgpack"]},
         lambda m: {**m, "files": {"params.msgpack": "0"}},
-        lambda m: {**m, "files": {"../params.msgpack": {"sha256": "0"}}},
+        lambda m: {**m, "files": {"params.msgpack": {"bytes": 1}}},
         lambda m: {**m, "config": {**m["config"], "mode": "none"}},
+        lambda m: {**m, "config": {**m["config"], "lr_rl": 10**400}},
+        lambda m: {**m, "config": [m["config"]]},
         lambda m: {n: m[n] for n in m if n != "updates"},
+        file("../params.msgpack"),
+        file("/etc/hostname.json"),
+        file("a/b.npy"),
+        file("..npy"),
+        file(""),
+        file("manifest.json"),
+        file("params.pkl"),
+        file("params.msgpack\n"),
+        file("params\0.npy"),
+        entry(bytes="1"),
+        entry(sha256=None),
+        entry(dtype=None),
+        entry(shape="(2, 3, 4)"),
     ],
 )
-def test_a_manifest_of_another_form_is_refused(written, tmp_path, change):
-    shutil.copy(written / "params.msgpack", tmp_path)
-    manifest = json.loads((written / "manifest.json").read_text())
-    (tmp_path / "manifest.json").write_text(json.dumps(change(manifest)))
+def test_a_manifest_of_another_form_is_refused(copy, change):
+    resign(copy, change)
     with pytest.raises(ConfigError) as error:
-        checkpoint.load(checkpoint.read_manifest(tmp_path))
-    assert str(tmp_path) in str(error.value) and "\n" not in str(error.value)
+        checkpoint.read_manifest(copy)
+    assert str(copy) in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("size", [0, 100])
-def test_a_file_that_is_cut_short_is_refused(written, tmp_path, size):
-    shutil.copytree(written, tmp_path / "copy")
-    path = tmp_path / "copy" / "params.msgpack"
-    path.write_bytes(path.read_bytes()[:size])
-    with pytest.raises(ConfigError, match="params.msgpack: damaged"):
-        checkpoint.load(checkpoint.read_manifest(tmp_path / "copy"))
+@pytest.mark.parametrize("data", [b"", b"{", b"[" * 100_000, b"\xff", b"nan", b"9" * 5000, b" " * (1 << 25)])
+def test_a_manifest_that_is_no_json_is_refused(copy, data):
+    (copy / "manifest.json").write_bytes(data)
+    (copy / "manifest.sha256").write_text(f"{hashlib.sha256(data).hexdigest()}  manifest.json\n")
+    with pytest.raises(ConfigError, match="manifest.json: damaged"):
+        checkpoint.read_manifest(copy)
 
 
-def test_missing_files_are_named(written, tmp_path):
-    with pytest.raises(ConfigError, match="no checkpoint there"):
-        checkpoint.read_manifest(tmp_path)
-    with pytest.raises(ConfigError, match="no checkpoint there"):
-        checkpoint.read_manifest(tmp_path / "nowhere")
-    shutil.copytree(written, tmp_path / "copy")
-    (tmp_path / "copy" / "params.msgpack").unlink()
-    with pytest.raises(ConfigError, match="params.msgpack"):
-        checkpoint.load(checkpoint.read_manifest(tmp_path / "copy"))
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"shape": [2, 3, 5]},
+        {"shape": [24]},
+        {"shape": [2, 3, 4.0]},
+        {"shape": [True, 24]},
+        {"shape": [-2, -12]},
+        {"shape": [2**70, 0]},
+        {"shape": [1] * 100},
+        {"dtype": "|i1"},
+        {"dtype": "|O"},
+        {"dtype": "O"},
+        {"dtype": "|S1"},
+        {"dtype": "|V1"},
+        {"dtype": "u1"},
+        {"dtype": "(1,i4"},
+        {"dtype": "i4,f8"},
+        {"dtype": "__import__('os').abort()"},
+        {"bytes": 2**40},
+        {"bytes": -1},
+    ],
+    ids=str,
+)
+def test_an_entry_that_does_not_fit_its_array_is_refused(copy, values):
+    resign(copy, entry(**values))
+    manifest = checkpoint.read_manifest(copy)
+    with pytest.raises(ConfigError, match="frames.npy: damaged") as error:
+        checkpoint.load_array(manifest, "frames")
+    assert "\n" not in str(error.value)
 
 
-def test_a_file_that_fits_its_sum_but_holds_no_parameters_is_not_executed(written, tmp_path):
+def test_the_header_of_an_array_is_compared_and_not_parsed(copy, tmp_path):
+    trap = tmp_path / "executed"
+
+    class Trap:
+        def __reduce__(self):
+            return trap.touch, ()
+
+    def npy(array, **options):
+        buffer = io.BytesIO()
+        np.lib.format.write_array(buffer, array, **options)
+        return buffer.getvalue()
+
+    code = f"{{'descr': __import__('pathlib').Path({str(trap)!r}).touch(), 'shape': ()}}".encode()
+    good = (copy / "frames.npy").read_bytes()
+    for data in (
+        npy(np.array([Trap()], object), allow_pickle=True),
+        pickle.dumps(Trap()),
+        b"\x93NUMPY\x01\x00" + len(code).to_bytes(2, "little") + code + bytes(24),
+        npy(ARRAYS["frames"], version=(2, 0)),
+        npy(np.asfortranarray(ARRAYS["frames"])),
+        npy(ARRAYS["frames"].reshape(3, 2, 4)),
+        npy(ARRAYS["frames"].astype(np.int8)),
+        good + b"\0",
+        good[:-1],
+        b"",
+    ):
+        replace(copy, "frames.npy", data)
+        with pytest.raises(ConfigError, match="frames.npy: damaged"):
+            checkpoint.load_array(whole(copy), "frames")
+    replace(copy, "frames.npy", good)
+    assert same_bits(checkpoint.load_array(whole(copy), "frames"), ARRAYS["frames"])
+    assert not trap.exists()
+
+
+def test_trees_and_numbers_that_fit_their_sum_but_are_none_are_not_executed(copy, tmp_path):
     # Whoever writes both files can make the sums fit; then the format has to be harmless by itself.
     trap = tmp_path / "executed"
 
@@ -192,18 +646,35 @@ def test_a_file_that_fits_its_sum_but_holds_no_parameters_is_not_executed(writte
             return trap.touch, ()
 
     trapped = pickle.dumps(Trap())
-    for data in (trapped, msgpack.packb({"encoder": msgpack.ExtType(1, trapped), "heads": {}}), b"\x01"):
-        check_refused(written, tmp_path, data)
+    extension = msgpack.packb({"encoder": msgpack.ExtType(1, trapped), "heads": {}})
+    for data in (trapped, extension, b"\x01", b"", b"[]", b"\x91" * 100_000, b"[" * 100_000):
+        for file, load in (
+            ("params.msgpack", checkpoint.load),
+            ("learner.msgpack", lambda m: checkpoint.load_tree(m, "learner")),
+            ("run.json", checkpoint.load_numbers),
+        ):
+            replace(copy, file, data)
+            with pytest.raises(ConfigError, match=file) as error:
+                load(whole(copy))
+            assert "\n" not in str(error.value)
     assert not trap.exists()
 
 
-def check_refused(written, tmp_path, data):
-    manifest = json.loads((written / "manifest.json").read_text())
-    manifest["files"]["params.msgpack"] = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
-    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
-    (tmp_path / "params.msgpack").write_bytes(data)
-    with pytest.raises(ConfigError, match="params.msgpack"):
-        checkpoint.load(checkpoint.read_manifest(tmp_path))
+@pytest.mark.parametrize("bytes", [2**45, 2**70])
+def test_a_size_that_no_file_has_asks_for_no_memory(copy, bytes):
+    change = {"bytes": bytes, "sha256": "0"}
+    resign(copy, lambda m: m | {"files": m["files"] | {"params.msgpack": change, "run.json": change}})
+    manifest = checkpoint.read_manifest(copy)
+    for load in (checkpoint.load, checkpoint.load_numbers):
+        with pytest.raises(ConfigError, match="damaged"):
+            load(manifest)
+
+
+@pytest.mark.parametrize("text", ["NaN", "[Infinity]", "-Infinity", "1e999"])
+def test_numbers_are_finite(copy, text):
+    replace(copy, "run.json", f'{{"x": {text}}}'.encode())
+    with pytest.raises(ConfigError, match="run.json: damaged"):
+        checkpoint.load_numbers(whole(copy))
 
 
 def test_parameters_of_another_form_are_refused_by_name():
@@ -219,6 +690,16 @@ def test_parameters_of_another_form_are_refused_by_name():
     cases.append((extra, "'inverse'.*on one side only"))
     for tree, message in cases:
         with pytest.raises(ConfigError, match="the source: parameter.*" + message):
+            checkpoint.load_into(template, tree, "the source")
+
+
+@pytest.mark.parametrize("branch", [{}, []], ids=["branch", "list"])
+def test_parameters_with_an_empty_branch_more_or_less_are_refused(branch):
+    template, extra, less = make_params(), make_params(), make_params()
+    extra["heads"]["inverse"] = branch
+    del less["heads"]["latent_l2"]
+    for tree in (extra, less):
+        with pytest.raises(ConfigError, match="the source: parameters do not fit"):
             checkpoint.load_into(template, tree, "the source")
 
 

@@ -5,6 +5,7 @@ a window in the host's memory to the temporal-difference errors back there.
 """
 
 import json
+import tempfile
 import time
 from pathlib import Path
 from typing import Any
@@ -77,30 +78,30 @@ def whole_run(seconds: float) -> dict[str, float]:
     """Projects 5M env steps of Pong from a stretch of the loop and one evaluation."""
     from experiments.benchmarks.jax_side import config_of
     from srl_jax.loop import Run
-    from srl_jax.metrics import MetricsWriter
 
     config = config_of(NATURE)
-    run = Run(config, Path(), progress=False)
-    try:
-        run.start()
-        while run.updates < 20:
-            run.step()
-        first, start = run.env_steps, time.perf_counter()
-        while time.perf_counter() - start < seconds:
-            run.step()
-        rate = (run.env_steps - first) / (time.perf_counter() - start)
-        with MetricsWriter(Path("/dev/null"), None) as run.writer:
-            seconds = []
-            for _ in range(2):  # the first compiles
-                start = time.perf_counter()
-                run.start_evaluation()
-                run.finish_evaluation()
-                seconds.append(time.perf_counter() - start)
-            evaluation = seconds[1]
-    finally:
-        run.env_thread.shutdown()
-        run.eval_thread.shutdown()
-        run.env.close()
+    with tempfile.TemporaryDirectory() as out:
+        run = Run(config, Path(out), progress=False)
+        try:
+            run.start()
+            while run.updates < 20:
+                run.step()
+            first, start = run.env_steps, time.perf_counter()
+            while time.perf_counter() - start < seconds:
+                run.step()
+            rate = (run.env_steps - first) / (time.perf_counter() - start)
+            with run.report:
+                seconds = []
+                for _ in range(2):  # the first compiles
+                    start = time.perf_counter()
+                    run.start_evaluation(run.state.params, run.env_steps, run.updates)
+                    run.finish_evaluation()
+                    seconds.append(time.perf_counter() - start)
+        finally:
+            run.env_thread.shutdown()
+            run.eval_thread.shutdown()
+            run.env.close()
+    evaluation = seconds[1]
     evaluations = config.steps // config.eval_every + 1
     minutes = (config.steps / rate + evaluations * evaluation) / 60
     return {"env_steps_per_s": rate, "evaluation_s": evaluation, "minutes": minutes}

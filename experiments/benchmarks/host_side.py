@@ -40,7 +40,7 @@ class Loop:
         from experiments.benchmarks.jax_side import config_of
         from srl_jax import loop
 
-        self._means, self._acting = loop.means, []
+        self._acting = []
         act_and_step = loop.act_and_step
 
         def timed_act_and_step(*arguments):
@@ -101,10 +101,7 @@ class Loop:
 
     def _forget(self) -> None:
         """As after a row."""
-        import jax
-
-        self._means(jax.device_get(self._run.log))
-        self._run.log, self._run.returns = [], []
+        self._run.report.means.take()
         self._acting.clear()
 
 
