@@ -15,6 +15,8 @@ from typing import Any
 
 import numpy as np
 
+from srl_jax.reading import ROWS, parse_json, read_bytes
+
 KINDS = ("train", "eval")
 LEADING = ("kind", "env_steps", "updates", "wall_s")
 """The keys that every row begins with, in this order; the rest follow sorted."""
@@ -112,9 +114,10 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
         The rows in the order of the file; null is None.
 
     Raises:
+        OSError: if it cannot be read, see `srl_jax.reading.read_bytes`.
         ValueError: if any other line is not a JSON object, naming the file and the line.
     """
-    lines = Path(path).read_bytes().split(b"\n")
+    lines = read_bytes(path, ROWS).split(b"\n")
     rows = []
     for number, line in enumerate(lines, 1):
         try:
@@ -135,7 +138,7 @@ def _parse(line: bytes) -> dict[str, Any]:
     def refuse(name):
         raise ValueError(f"{name} is not JSON")
 
-    row = json.loads(line.decode("utf-8"), parse_constant=refuse)
+    row = parse_json(line, refuse)
     if not isinstance(row, dict):
         raise ValueError("not a JSON object")
     return row
