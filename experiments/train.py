@@ -8,7 +8,6 @@ import contextlib
 import dataclasses
 import functools
 import importlib.util
-import json
 import os
 import shutil
 from collections.abc import Callable
@@ -19,6 +18,7 @@ from absl import flags
 from experiments import flags as config_flags
 from experiments import runtime
 from srl_jax.config import INFOS, Config, resolve
+from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import ConfigError, build, parse
 
 FLAGS = flags.FLAGS
@@ -129,7 +129,7 @@ def check_out(out: str | None, overwrite: bool, config: Config) -> Path:
 def _is_run(path: Path) -> bool:
     """Whether the directory holds a config.json that this program wrote."""
     try:
-        values = json.loads((path / "config.json").read_text(encoding="utf-8"))
+        values = parse_json(read_bytes(path / "config.json", SETTINGS))
     except (OSError, ValueError):
         return False
     return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()

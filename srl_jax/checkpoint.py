@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srl_jax.config import Config
-from srl_jax.specs import ConfigError
+from srl_jax.reading import SETTINGS, parse_json, read_bytes
+from srl_jax.specs import LIMITS, ConfigError
 
 _MANIFEST, _PARAMS, _FORMAT = "manifest.json", "params.msgpack", 1
 
@@ -98,23 +99,24 @@ def read_manifest(path: str | Path) -> Manifest:
         ConfigError: there is none, or it is damaged; one line.
     """
     path = Path(path)
-    for folder in (path / "checkpoints", path):
-        if not (path / _MANIFEST).exists() and folder.is_dir() and _all(folder):
-            path = _all(folder)[-1]
     try:
-        content = json.loads((path / _MANIFEST).read_text(encoding="utf-8"))
-        if content["format"] != _FORMAT:
+        for folder in (path / "checkpoints", path):
+            if not (path / _MANIFEST).exists() and folder.is_dir() and _all(folder):
+                path = _all(folder)[-1]
+        content = parse_json(read_bytes(path / _MANIFEST, SETTINGS))
+        if type(content["format"]) is not int or content["format"] != _FORMAT:
             raise ConfigError(f"{path}: checkpoint of format {content['format']}, not {_FORMAT}")
         numbers = [content[name] for name in ("num_actions", "env_steps", "updates")]
-        if not all(type(number) is int for number in numbers):
-            raise ValueError("counts are not integers")
+        if not all(type(number) is int and 0 <= number <= LIMITS[int] for number in numbers):
+            raise ValueError("counts are not whole numbers, at least 0")
         files = content["files"]
-        if list(files) != [_PARAMS] or type(files[_PARAMS]["sha256"]) is not str:
+        entry = files[_PARAMS] if list(files) == [_PARAMS] else {"sha256": None, "bytes": None}
+        if type(entry["sha256"]) is not str or type(entry["bytes"]) is not int:
             raise ValueError("files are not what they should be")
         config = json.dumps(content["config"])
-    except OSError:
+    except OSError as error:
         raise ConfigError(
-            f"{path}: no checkpoint there; name a run directory or one of its checkpoints"
+            f"{path}: no checkpoint there; name a run directory or one of its checkpoints ({error.strerror})"
         ) from None
     except (ValueError, KeyError, TypeError) as error:
         if isinstance(error, ConfigError):
@@ -136,15 +138,18 @@ def load(manifest: Manifest) -> Any:
 
     path = manifest.path / _PARAMS
     try:
-        data = path.read_bytes()
+        data = read_bytes(path, manifest.files[_PARAMS]["bytes"])
     except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        raise ConfigError(f"{path}: damaged: {error.strerror}") from None
+    if len(data) != manifest.files[_PARAMS]["bytes"]:
+        raise ConfigError(f"{path}: damaged: its size is not the manifest's")
     if hashlib.sha256(data).hexdigest() != manifest.files[_PARAMS]["sha256"]:
         raise ConfigError(f"{path}: damaged: its sha256 is not the manifest's")
     try:
         tree = serialization.msgpack_restore(data)
         if set(tree) != {"encoder", "heads"}:
             raise ValueError("not an encoder and heads")
+        _check(tree)
     except Exception as error:  # msgpack's and flax's own; the sum fits, so somebody wrote it so
         raise ConfigError(f"{path}: not parameters ({type(error).__name__}: {error})") from None
     return tree
@@ -219,6 +224,17 @@ def _same(flag: str, config: Config, found: Config, field: str, what: str) -> No
 def _all(folder: Path) -> list[Path]:
     """The finished checkpoints of a folder, oldest first."""
     return sorted(p for p in folder.glob("[0-9]*") if p.is_dir() and (p / _MANIFEST).is_file())
+
+
+def _check(tree: dict) -> None:
+    """Raises an error unless a tree holds named arrays and nothing else."""
+    for name, branch in tree.items():
+        if type(name) is not str:
+            raise ValueError(f"{name!r} is not a name")
+        if isinstance(branch, dict):
+            _check(branch)
+        elif not isinstance(branch, np.ndarray):
+            raise ValueError(f"{name} is not an array")
 
 
 def _map(function, tree: Any) -> Any:

@@ -27,6 +27,7 @@ from srl_jax.evaluate import Evaluation, evaluate
 from srl_jax.metrics import MetricsWriter
 from srl_jax.progress import Progress
 from srl_jax.replay import Replay
+from srl_jax.specs import ConfigError
 from srl_jax.types import Window
 from srl_jax.update import Hyper, make_latents, named_key
 
@@ -120,8 +121,11 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
         srl_jax.specs.ConfigError: there is none, it is damaged, or does not fit this code.
     """
     manifest = checkpoint.read_manifest(path)
-    agent = make_agent(manifest.config, manifest.num_actions)
-    template = jax.eval_shape(agent.init, jax.random.key(0)).params
+    try:
+        agent = make_agent(manifest.config, manifest.num_actions)
+        template = jax.eval_shape(agent.init, jax.random.key(0)).params
+    except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
+        raise ConfigError(f"{manifest.path}: {error}") from None
     params = checkpoint.load_into(template, checkpoint.load(manifest), str(manifest.path))
     return agent, params, manifest
 
@@ -142,16 +146,22 @@ class Run:
         self.key = jax.random.key(config.seed)
         self.state = self.agent.init(self.key, self.initial_encoder())
         frame = self.env.single_observation_space.shape
-        self.replay = Replay(
-            capacity=config.buffer_size,
-            num_streams=config.num_envs,
-            frame_shape=frame,
-            stack=config.frame_stack,
-            horizon=self.agent.horizon,
-            gamma=config.gamma,
-            alpha=self.agent.algorithm.alpha if self.agent.mode.rl else 0.0,
-            seed=seed_for(config.seed, "replay"),
-        )
+        try:
+            self.replay = Replay(
+                capacity=config.buffer_size,
+                num_streams=config.num_envs,
+                frame_shape=frame,
+                stack=config.frame_stack,
+                horizon=self.agent.horizon,
+                gamma=config.gamma,
+                alpha=self.agent.algorithm.alpha if self.agent.mode.rl else 0.0,
+                seed=seed_for(config.seed, "replay"),
+            )
+        except (ValueError, MemoryError) as error:
+            raise ConfigError(
+                f"--buffer_size={config.buffer_size}: {error}; --num_envs={config.num_envs}, "
+                f"--frame_stack={config.frame_stack} and --rl={config.rl} say how much it takes"
+            ) from None
         self.random = random_policy(self.num_actions, seed_for(config.seed, "random policy"))
         self.given = self.given_policy() if config.policy_from else None
         self.act_key = named_key(self.key, "act")
@@ -438,7 +448,10 @@ class Run:
         """The policy of `policy_from`, without noise."""
         agent, params, manifest = load_agent(self.config.policy_from)
         if manifest.num_actions != self.num_actions:
-            raise ValueError("the policy is for another number of actions")
+            raise ConfigError(
+                f"--policy_from={self.config.policy_from}: its policy has {manifest.num_actions} actions, "
+                f"{self.config.game} has {self.num_actions}"
+            )
         return greedy_policy(agent, params, named_key(self.key, "given policy"))
 
 

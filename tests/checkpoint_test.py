@@ -3,12 +3,14 @@
 import dataclasses
 import hashlib
 import json
+import os
 import pickle
 import shutil
 
 import msgpack
 import numpy as np
 import pytest
+from flax import serialization
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -145,10 +147,15 @@ def test_a_damaged_manifest_is_an_error_of_one_line_or_still_describes_the_file(
     [
         lambda m: [],
         lambda m: {**m, "format": 2},
+        lambda m: {**m, "format": True},
         lambda m: {**m, "num_actions": "3"},
+        lambda m: {**m, "num_actions": -1},
+        lambda m: {**m, "env_steps": 2**31},
         lambda m: {**m, "files": {}},
         lambda m: {**m, "files": ["params.msgpack"]},
         lambda m: {**m, "files": {"params.msgpack": "0"}},
+        lambda m: {**m, "files": {"params.msgpack": {**m["files"]["params.msgpack"], "bytes": "100"}}},
+        lambda m: {**m, "files": {"params.msgpack": {**m["files"]["params.msgpack"], "bytes": 10**30}}},
         lambda m: {**m, "files": {"../params.msgpack": {"sha256": "0"}}},
         lambda m: {**m, "config": {**m["config"], "mode": "none"}},
         lambda m: {n: m[n] for n in m if n != "updates"},
@@ -195,6 +202,40 @@ def test_a_file_that_fits_its_sum_but_holds_no_parameters_is_not_executed(writte
     for data in (trapped, msgpack.packb({"encoder": msgpack.ExtType(1, trapped), "heads": {}}), b"\x01"):
         check_refused(written, tmp_path, data)
     assert not trap.exists()
+
+
+@pytest.mark.parametrize(
+    "leaf", [3, 0.5, "text", None, [0.0], np.float32(1), {5: np.zeros(2, np.float32)}], ids=repr
+)
+def test_only_named_arrays_are_parameters(written, tmp_path, leaf):
+    data = serialization.msgpack_serialize({"encoder": {"kernel": leaf}, "heads": {}})
+    check_refused(written, tmp_path, data)
+
+
+@pytest.mark.parametrize("content", ["[" * 100_000, '{"format": 1, "format": 1}'], ids=["deep", "twice"])
+def test_a_manifest_that_is_no_plain_json_is_refused(tmp_path, content):
+    (tmp_path / "manifest.json").write_text(content)
+    with pytest.raises(ConfigError, match="manifest.json: damaged"):
+        checkpoint.read_manifest(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["manifest.json", "params.msgpack"])
+@pytest.mark.parametrize("device", [False, True], ids=["pipe", "device"])
+def test_pipes_and_devices_are_not_read(written, tmp_path, name, device):
+    folder = tmp_path / "copy"
+    shutil.copytree(written, folder)
+    (folder / name).unlink()
+    if device:
+        (folder / name).symlink_to("/dev/zero")
+    else:
+        os.mkfifo(folder / name)
+    with pytest.raises(ConfigError, match="Not a regular file"):
+        checkpoint.load(checkpoint.read_manifest(folder))
+
+
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(ConfigError, match="no checkpoint there"):
+        checkpoint.read_manifest("x" * 5000)
 
 
 def check_refused(written, tmp_path, data):
