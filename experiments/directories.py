@@ -1,7 +1,6 @@
 """Run directories: new ones, ones to overwrite, ones to go on from; one writer at a time."""
 
 import contextlib
-import json
 import shutil
 import sys
 from collections.abc import Iterator
@@ -12,6 +11,7 @@ from srl_jax import checkpoint, rundir
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config, difference, told_to_xla
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
 
 def say(line: str) -> None:
@@ -68,8 +68,8 @@ def _is_run(path: Path) -> bool:
     """Whether the directory, or one of seeds in it, holds a config.json that this program wrote."""
     for file in (path / "config.json", *sorted(path.glob("seed*/config.json"))):
         try:
-            values = json.loads(file.read_text(encoding="utf-8"))
-        except (OSError, ValueError, RecursionError):
+            values = parse_json(read_bytes(file, SETTINGS))
+        except (OSError, ValueError):
             continue
         if isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys():
             return True
@@ -145,7 +145,7 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
         return None
     if differing := difference(manifest.config, config):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
-    about = json.loads((path / "config.json").read_text(encoding="utf-8"))
+    about = parse_json(read_bytes(path / "config.json", SETTINGS))
     then, now = about.get("environment"), told_to_xla()
     if then != now:
         say(f"{path}: XLA was told {then} and is told {now} now: roundings differ")

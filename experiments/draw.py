@@ -6,6 +6,7 @@ asked: `--thesis=6.2/rl_only_nature`.
 
 from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 from absl import flags
 
@@ -14,7 +15,8 @@ from experiments import plots
 from srl_jax.config import Config
 from srl_jax.data import thesis_curve
 from srl_jax.errors import ConfigError
-from srl_jax.metrics import read_metrics
+from srl_jax.metrics import KINDS, read_metrics
+from srl_jax.specs import LIMITS
 
 FLAGS = flags.FLAGS
 
@@ -32,11 +34,12 @@ def draw_run(run: Path, config: Config, *, thesis: str = "", pictures: dict | No
         The files written; empty if matplotlib is not installed.
 
     Raises:
-        ConfigError: the thesis has no such curve.
+        ConfigError: the thesis has no such curve, metrics.jsonl is not what training writes, or the figures
+            cannot be written.
     """
     if not plots.available():
         return []
-    rows = read_metrics(run / "metrics.jsonl")
+    rows = read_rows(run / "metrics.jsonl")
     figures = run / "figures"
     title = f"{config.game}, {config.mode}, {config.encoder.partition(':')[0]}, seed {config.seed}"
     curve = plots.learning_curve(
@@ -47,6 +50,39 @@ def draw_run(run: Path, config: Config, *, thesis: str = "", pictures: dict | No
         path = figures / f"{name}.png"
         written.append(plots.image_panel(inputs, targets, outputs, path, f"{title}: {name}"))
     return [path for path in written if path]
+
+
+def read_rows(path: Path) -> list[dict]:
+    """`srl_jax.metrics.read_metrics`, with what is drawn of each row checked.
+
+    Raises:
+        ConfigError: it cannot be read, or holds something else than training writes; one line.
+    """
+    try:
+        rows = read_metrics(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    for number, row in enumerate(rows, 1):
+        if row.get("kind") not in KINDS:
+            raise ConfigError(f"{path}, line {number}: kind is none of {', '.join(KINDS)}")
+        if type(row.get("env_steps")) is not int or not 0 <= row["env_steps"] <= LIMITS[int]:
+            raise ConfigError(f"{path}, line {number}: env_steps is no count")
+        for key, value in row.items():
+            if key == "eval/returns":
+                good = isinstance(value, list) and all(map(_is_number, value))
+            else:
+                drawn = key == "eval/return_mean" or key.split("/")[0] in ("loss", "grad_norm")
+                good = not drawn or _is_number(value)
+            if not good:
+                raise ConfigError(f"{path}, line {number}: {key} is not made of numbers of single precision")
+    return rows
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that single precision holds, or null."""
+    return value is None or (type(value) in (int, float) and abs(value) <= LIMITS[float])
 
 
 def _reference(config: Config, thesis: str) -> list[tuple[str, Iterable, Iterable]]:
@@ -66,7 +102,11 @@ def main(argv: list[str]) -> None:
     config = Config.load(FLAGS.run)
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
-    for path in draw_run(Path(FLAGS.run), config, thesis=FLAGS.thesis):
+    try:
+        written = draw_run(Path(FLAGS.run), config, thesis=FLAGS.thesis)
+    except OSError as error:
+        raise ConfigError(f"--run={FLAGS.run}: {error.filename}: {error.strerror}") from None
+    for path in written:
         print(path)
 
 

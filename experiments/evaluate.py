@@ -13,6 +13,7 @@ from absl import flags
 from experiments import flags as config_flags
 from experiments import runtime
 from srl_jax.errors import ConfigError
+from srl_jax.specs import Info
 
 FLAGS = flags.FLAGS
 
@@ -29,7 +30,14 @@ def check_gif(path: str) -> None:
         raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
     if Path(path).suffix.lower() != ".gif":
         raise ConfigError(f"--gif={path}: must end in .gif")
-    if Path(path).exists():
+    config_flags.check_name("gif", path)
+    try:
+        Path(path).lstat()
+    except FileNotFoundError:
+        pass
+    except OSError as error:
+        raise ConfigError(f"--gif={path}: {error.strerror}") from None
+    else:
         raise ConfigError(f"--gif={path}: exists; name a new file")
     if not Path(path).absolute().parent.is_dir():
         raise ConfigError(f"--gif={path}: no such directory")
@@ -64,6 +72,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
 
     agent, params, manifest = loop.load_agent(FLAGS.run)
     env = loop.make_env(config, min(FLAGS.games, config.num_envs), FLAGS.seed)
+    if manifest.num_actions != env.single_action_space.n:
+        raise ConfigError(
+            f"{manifest.path}: its policy has {manifest.num_actions} actions, {config.game} has "
+            f"{env.single_action_space.n}"
+        )
     played = evaluate(
         loop.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
         env,
@@ -90,11 +103,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
 
 if __name__ == "__main__":
     flags.DEFINE_string("run", "", "run directory, or one of its checkpoints")
-    flags.DEFINE_integer("games", 10, "full games to play", lower_bound=1)
-    flags.DEFINE_integer("seed", 0, "of the games; the same seed gives the same games", lower_bound=0)
-    flags.DEFINE_float(
-        "epsilon", None, "probability of a random action; the run's eps_eval if not given", 0.0, 1.0
-    )
+    config_flags.define("games", Info(int, "full games to play", minimum=1, maximum=1_000_000), 10)
+    seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
+    config_flags.define("seed", seed, 0)
+    epsilon = "probability of a random action; the run's eps_eval if not given"
+    config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None)
     flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF")
     config_flags.define_runtime_flag()
     config_flags.run(functools.partial(main, prepare=runtime.prepare))

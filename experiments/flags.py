@@ -22,6 +22,9 @@ from srl_jax.specs import Info
 # The flags count as the entry point's own, so that --help shows them.
 flags.disclaim_key_flags()
 
+LONGEST = 4_000
+"""Characters of an error that are shown."""
+
 RL_OPTIONS: dict[str, tuple[str, Info]] = {
     "n_step": ("n_step", Info(int, "steps of the return", "env steps", minimum=1)),
     "num_atoms": ("atoms", Info(int, "atoms of the value distribution", "atoms", minimum=2)),
@@ -85,7 +88,18 @@ class _Serializer(flags.ArgumentSerializer):
         return "off" if value is None else specs.value_text(value)
 
 
-def _define(name: str, info: Info, default: Any, note: str, values: flags.FlagValues) -> None:
+def define(
+    name: str, info: Info, default: Any, values: flags.FlagValues = flags.FLAGS, note: str = ""
+) -> None:
+    """Defines a flag whose values an Info describes and checks.
+
+    Args:
+        name: of the flag.
+        info: its type, help and limits.
+        default: its value where it is not given; need not keep to the limits.
+        values: where to define it.
+        note: more for --help.
+    """
     text = info.help + (f" [{info.unit}]" if info.unit else "") + note
     if info.choices:
         text += f"; one of: {', '.join(info.choices)}"
@@ -99,9 +113,9 @@ def _define(name: str, info: Info, default: Any, note: str, values: flags.FlagVa
 def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
     """Defines a flag for every field of Config, `RL_OPTIONS` and --preset."""
     for name, info in INFOS.items():
-        _define(info.flag or name, info, getattr(Config(), name), "", values)
+        define(info.flag or name, info, getattr(Config(), name), values)
     for name, (option, info) in RL_OPTIONS.items():
-        _define(name, info, None, f"; short for --rl=NAME:{option}=..., and as --rl says", values)
+        define(name, info, None, values, f"; short for --rl=NAME:{option}=..., and as --rl says")
     flags.DEFINE_string(
         "preset",
         None,
@@ -113,7 +127,7 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
 def define_runtime_flag(values: flags.FlagValues = flags.FLAGS) -> None:
     """Defines --tune_runtime, see `experiments.runtime`; no field of Config, for it changes no setting."""
     help_text = "whether to set variables that make jax faster on a CPU, and to restart once if need be"
-    _define("tune_runtime", Info(str, help_text, choices=("auto", "off")), "auto", "", values)
+    define("tune_runtime", Info(str, help_text, choices=("auto", "off")), "auto", values)
 
 
 def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool = True) -> Config:
@@ -168,6 +182,7 @@ def check_place(flag: str, text: str) -> Path:
     Raises:
         ConfigError: neither holds.
     """
+    check_name(flag, text)
     path = Path(os.path.expanduser(text))
     try:
         if path.is_dir():
@@ -186,9 +201,31 @@ def check_place(flag: str, text: str) -> Path:
     return path
 
 
+def check_name(flag: str, text: str) -> None:
+    """Whether a path that is to be written to can be shown in a line.
+
+    Args:
+        flag: that it came from.
+        text: its value.
+
+    Raises:
+        ConfigError: it has a line break, another control character, or bytes that are no text.
+    """
+    odd = next((character for character in text if not character.isprintable()), None)
+    if odd is not None:
+        raise ConfigError(f"--{flag}={text}: has the character {odd!a}; name it with printable ones")
+
+
 def fail(message: Any, status: int = 2) -> NoReturn:
-    """Prints one line on stderr and exits."""
-    print("error: " + " ".join(str(message).split()), file=sys.stderr)
+    """Prints one line on stderr and exits.
+
+    What cannot be printed is shown as Python would write it; a long line loses its middle.
+    """
+    line = " ".join(str(message).split())
+    if len(line) > LONGEST:
+        line = f"{line[: LONGEST // 2]} [...] {line[-LONGEST // 2 :]}"
+    line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+    print("error: " + line, file=sys.stderr)
     sys.exit(status)
 
 
@@ -202,13 +239,16 @@ def parse(argv: list[str], values: flags.FlagValues = flags.FLAGS) -> list[str]:
     Returns:
         [the program's name].
     """
+    # absl would wait for a pipe there, read a device without end, and end in tracebacks.
+    if any(argument.lstrip("-").partition("=")[0] == "flagfile" for argument in argv[1:]):
+        fail("--flagfile: not taken; write the flags themselves, or use --preset")
     try:
         rest = values(argv)
     except flags.UnrecognizedFlagError as error:
         near = difflib.get_close_matches(error.flagname, list(values), n=1, cutoff=0.6)
         suggestion = f"did you mean --{near[0]}? " if near else ""
         fail(f"--{error.flagname}: no such flag; {suggestion}--helpfull lists them all")
-    except flags.Error as error:
+    except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
         fail(str(error).removeprefix("flag "))
     if len(rest) > 1:
         fail(f"unexpected argument {rest[1]!r}: write every option as --name=value; see --help")

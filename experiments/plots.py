@@ -50,7 +50,8 @@ def learning_curve(
     counts = sorted({len(game) for game in games if np.isfinite(game).all()})
 
     figure = _figure(6.4, 4.0)
-    axes = figure.add_subplot(title=title, xlabel=STEPS_LABEL)
+    axes = figure.add_subplot(xlabel=STEPS_LABEL)
+    axes.set_title(title, parse_math=False)
     over = f" over {' or '.join(map(str, counts))} games" if counts else ""
     axes.set_ylabel("mean return" + over)
     line = {"marker": "o", "markersize": 3.5} if len(evals) <= 60 else {}
@@ -117,7 +118,8 @@ def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path |
             kernel = np.full(span, 1 / span)
             smooth = [np.convolve(curve, kernel, mode="valid") for curve in (at, values)]
             axes.plot(*smooth, color=COLOURS[0], linewidth=1.4)
-        axes.set_title(key.replace("grad_norm", "gradient norm").replace("norm/", "norm, "), fontsize=9)
+        name = key.replace("grad_norm", "gradient norm").replace("norm/", "norm, ")
+        axes.set_title(name, fontsize=9, parse_math=False)
         if values.min() > 0 and values.max() >= 5 * values.min():
             _log_axis(axes, values.max() / values.min())
         _count_axis(axes)
@@ -176,7 +178,7 @@ def image_panel(
     bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02, aspect=12 * count)
     bar.set_label("absolute difference", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    figure.suptitle(title, fontsize=10)
+    figure.suptitle(title, fontsize=10).set_parse_math(False)
     return _save(figure, path)
 
 

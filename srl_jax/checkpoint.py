@@ -30,6 +30,8 @@ import numpy as np
 
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.reading import parse_json
+from srl_jax.specs import LIMITS
 
 MANIFEST, CHECKSUM, PARAMS, NUMBERS = "manifest.json", "manifest.sha256", "params.msgpack", "run.json"
 FORMAT = 2
@@ -276,11 +278,11 @@ def read_manifest(path: str | Path) -> Manifest:
     if written != f"{hashlib.sha256(data).hexdigest()}  {MANIFEST}\n".encode():
         raise ConfigError(f"{path / MANIFEST}: damaged: its sha256 is not the one in {CHECKSUM}")
     try:
-        content = json.loads(data)
-        if content["format"] != FORMAT:
+        content = parse_json(data)
+        if type(content["format"]) is not int or content["format"] != FORMAT:
             raise ConfigError(f"{path}: checkpoint of format {content['format']}, not {FORMAT}")
         numbers = [content[name] for name in ("num_actions", "env_steps", "updates")]
-        if not all(type(number) is int and number >= 0 for number in numbers):
+        if not all(type(number) is int and 0 <= number <= LIMITS[int] for number in numbers):
             raise ValueError("counts are not whole numbers")
         files = {name: _entry(name, about) for name, about in content["files"].items()}
         if PARAMS not in files:
@@ -388,6 +390,7 @@ def load_tree(manifest: Manifest, name: str) -> dict[str, Any]:
         tree = serialization.msgpack_restore(data)
         if type(tree) is not dict:
             raise ValueError("not a tree")
+        _check_tree(tree)
     except Exception as error:  # msgpack's and flax's own; the sum fits, so somebody wrote it so
         raise ConfigError(f"{path}: not a tree of arrays ({type(error).__name__}: {_line(error)})") from None
     return tree
@@ -592,6 +595,17 @@ def _all(folder: Path) -> list[Path]:
 def _about(entry: Entry) -> dict[str, Any]:
     """An entry as JSON holds it."""
     return {field: value for field, value in entry._asdict().items() if value is not None}
+
+
+def _check_tree(tree: dict) -> None:
+    """Raises an error unless a tree holds named arrays and nothing else."""
+    for name, branch in tree.items():
+        if type(name) is not str:
+            raise ValueError(f"{name!r} is not a name")
+        if isinstance(branch, dict):
+            _check_tree(branch)
+        elif not isinstance(branch, np.ndarray):
+            raise ValueError(f"{name} is not an array")
 
 
 def _map(function, tree: Any) -> Any:

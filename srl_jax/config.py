@@ -18,6 +18,7 @@ from typing import Any
 from srl_jax import modes, specs
 from srl_jax.envs import GAMES
 from srl_jax.errors import ConfigError
+from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import Info
 
 _PACKAGES = (
@@ -75,12 +76,12 @@ class Config:
     steps: int = _steps(5_000_000, "length of the run")
     num_envs: int = _value(
         int, 10, "training environments; each moves one env step between updates", "environments",
-        minimum=1,
+        minimum=1, maximum=10_000,
     )  # fmt: skip
     buffer_size: int = _steps(100_000, "capacity of the replay buffer", unit="transitions")
     batch_size: int = _steps(32, "batch of one update", unit="transitions")
     updates_per_step: float = _value(
-        float, 0.1, "gradient updates for each env step", "updates per env step", above=0
+        float, 0.1, "gradient updates for each env step", "updates per env step", above=0, maximum=1_000
     )
     learn_start: int = _steps(320, "when learning starts", minimum=0)
     gamma: float = _share(0.99, "discount", "per env step")
@@ -101,7 +102,7 @@ class Config:
     max_grad_norm: float = _value(
         float, 0.0, "global gradient norm that updates are clipped to; 0: no clipping", minimum=0
     )
-    adam_eps: float = _value(float, 1e-8, "Adam's epsilon", above=0)
+    adam_eps: float = _value(float, 1e-8, "Adam's epsilon", minimum=1e-37)
 
     beta: float = _share(0.4, "importance weights' exponent at the start", "exponent")
     beta_final: float = _share(1.0, "importance weights' exponent at the end", "exponent")
@@ -133,12 +134,22 @@ class Config:
     life_loss: bool = _value(bool, True, "a lost life ends the return (not the game) in training")
     sticky_actions: float = _share(0.0, "that the emulator repeats the last action")
     noop_max: int = _value(
-        int, 30, "random no-ops at the start of a game are fewer than this", "emulator frames", minimum=0
+        int,
+        30,
+        "random no-ops at the start of a game are fewer than this",
+        "emulator frames",
+        minimum=0,
+        maximum=1_000,
     )
     frame_size: int = _value(
-        int, 84, "height and width of a frame; Catch knows 42 and 84", "pixels", minimum=1
+        int,
+        84,
+        "height and width of a frame; Catch knows 42 and 84",
+        "pixels",
+        minimum=1,
+        maximum=1_024,
     )
-    frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1)
+    frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1, maximum=256)
 
     encoder_from: str = _value(str, "", "run directory or checkpoint that the encoder starts from")
     policy_from: str = _value(
@@ -152,7 +163,7 @@ class Config:
         for name, info in INFOS.items():
             value = getattr(self, name)
             # JSON and people write 1 for 1.0; one type keeps the round trip exact.
-            if info.kind is float and type(value) is int:
+            if info.kind is float and type(value) is int and abs(value) <= specs.LIMITS[float]:
                 value = float(value)
                 object.__setattr__(self, name, value)
             right_type = type(value) is info.kind or (info.optional and value is None)
@@ -182,14 +193,14 @@ class Config:
         return json.dumps(dataclasses.asdict(self), indent=2)
 
     @classmethod
-    def from_json(cls, text: str) -> "Config":
+    def from_json(cls, text: str | bytes) -> "Config":
         """Reads `to_json`'s text, or a run's config.json. A missing field takes its default.
 
         Raises:
             ConfigError: not a JSON object, an unknown field, or a value out of its limits.
         """
         try:
-            values = json.loads(text)
+            values = parse_json(text)
         except ValueError as error:
             raise ConfigError(f"config: not JSON: {error}") from None
         if not isinstance(values, dict):
@@ -209,7 +220,7 @@ class Config:
         """
         path = Path(run) / "config.json"
         try:
-            return cls.from_json(path.read_text(encoding="utf-8"))
+            return cls.from_json(read_bytes(path, SETTINGS))
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror}; not a run directory") from None
         except ConfigError as error:

@@ -23,7 +23,7 @@ from srl_jax import checkpoint, envs, snapshot
 from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
-from srl_jax.errors import Diverged
+from srl_jax.errors import ConfigError, Diverged
 from srl_jax.evaluate import Evaluation, evaluate
 from srl_jax.replay import Replay
 from srl_jax.reporting import Report
@@ -132,8 +132,12 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
         srl_jax.errors.ConfigError: there is none, it is damaged, or does not fit this code.
     """
     manifest = checkpoint.read_manifest(path)
-    agent = make_agent(manifest.config, manifest.num_actions)
-    params = checkpoint.load_into(agent.shapes().params, checkpoint.load(manifest), str(manifest.path))
+    try:
+        agent = make_agent(manifest.config, manifest.num_actions)
+        template = agent.shapes().params
+    except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
+        raise ConfigError(f"{manifest.path}: {error}") from None
+    params = checkpoint.load_into(template, checkpoint.load(manifest), str(manifest.path))
     return agent, params, manifest
 
 
@@ -163,16 +167,22 @@ class Run:
         self.key = jax.random.key(config.seed)
         self.state = self.agent.init(self.key, self.initial_encoder())
         frame = self.env.single_observation_space.shape
-        self.replay = Replay(
-            capacity=config.buffer_size,
-            num_streams=config.num_envs,
-            frame_shape=frame,
-            stack=config.frame_stack,
-            horizon=self.agent.horizon,
-            gamma=config.gamma,
-            alpha=self.agent.algorithm.alpha if self.agent.mode.rl else 0.0,
-            seed=seed_for(config.seed, "replay"),
-        )
+        try:
+            self.replay = Replay(
+                capacity=config.buffer_size,
+                num_streams=config.num_envs,
+                frame_shape=frame,
+                stack=config.frame_stack,
+                horizon=self.agent.horizon,
+                gamma=config.gamma,
+                alpha=self.agent.algorithm.alpha if self.agent.mode.rl else 0.0,
+                seed=seed_for(config.seed, "replay"),
+            )
+        except (ValueError, MemoryError) as error:
+            raise ConfigError(
+                f"--buffer_size={config.buffer_size}: {error}; --num_envs={config.num_envs}, "
+                f"--frame_stack={config.frame_stack} and --rl={config.rl} say how much it takes"
+            ) from None
         self.random = np.random.default_rng(seed_for(config.seed, "random policy"))
         self.given = self.given_policy() if config.policy_from else None
         self.act_key = named_key(self.key, "act")
@@ -507,5 +517,8 @@ class Run:
         """The policy of `policy_from`, without noise."""
         agent, params, manifest = load_agent(self.config.policy_from)
         if manifest.num_actions != self.num_actions:
-            raise ValueError("the policy is for another number of actions")
+            raise ConfigError(
+                f"--policy_from={self.config.policy_from}: its policy has {manifest.num_actions} actions, "
+                f"{self.config.game} has {self.num_actions}"
+            )
         return greedy_policy(agent, params, named_key(self.key, "given policy"))

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srl_jax.errors import ConfigError
+from srl_jax.reading import ROWS, parse_json, read_bytes
 
 KINDS = ("train", "eval")
 LEADING = ("kind", "env_steps", "updates", "wall_s")
@@ -146,9 +147,10 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
         The rows in the order of the file; null is None.
 
     Raises:
+        OSError: if it cannot be read, see `srl_jax.reading.read_bytes`.
         ValueError: if any other line is not a JSON object, naming the file and the line.
     """
-    lines = Path(path).read_bytes().split(b"\n")
+    lines = read_bytes(path, ROWS).split(b"\n")
     rows = []
     for number, line in enumerate(lines, 1):
         try:
@@ -169,7 +171,7 @@ def _parse(line: bytes) -> dict[str, Any]:
     def refuse(name):
         raise ValueError(f"{name} is not JSON")
 
-    row = json.loads(line.decode("utf-8"), parse_constant=refuse)
+    row = parse_json(line, refuse)
     if not isinstance(row, dict):
         raise ValueError("not a JSON object")
     return row

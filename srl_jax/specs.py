@@ -14,6 +14,13 @@ from typing import Any, NamedTuple
 
 from srl_jax.errors import ConfigError
 
+LIMITS = {int: 2**31 - 1, float: 3.4028234663852886e38}
+"""The largest number of each kind, where no smaller one is set: what 32 bits hold, as devices and emulators
+count and compute."""
+
+MOST_UNITS = 2**16
+"""The largest size of a layer that an option may ask for."""
+
 _KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
 
@@ -110,7 +117,7 @@ class Info(NamedTuple):
         kind: bool, int, float, str, or tuple (of str: a flag that may be repeated).
         help: one line for --help.
         unit: "env steps", say; empty where there is none.
-        minimum: the smallest value; None for no limit. Likewise `maximum`.
+        minimum: the smallest value; None for no limit but `LIMITS`. Likewise `maximum`.
         above: the value must be larger than this.
         choices: the valid texts; empty for any.
         optional: the value may be None, written "off".
@@ -138,8 +145,11 @@ class Info(NamedTuple):
             raise ValueError(f"must be at least {self.minimum:g}{unit}")
         if self.above is not None and not value > self.above:
             raise ValueError(f"must be above {self.above:g}{unit}")
-        if self.maximum is not None and not value <= self.maximum:
-            raise ValueError(f"must be at most {self.maximum:.10g}{unit}")
+        maximum = LIMITS.get(self.kind) if self.maximum is None else self.maximum
+        if maximum is not None and not value <= maximum:
+            raise ValueError(f"must be at most {maximum:.10g}{unit}")
+        if self.kind in LIMITS and not value >= -LIMITS[self.kind]:
+            raise ValueError(f"must be at least {-LIMITS[self.kind]:.10g}{unit}")
 
     def parse(self, text: str) -> Any:
         """The value of a text, checked; of one element's text where the kind is tuple.
@@ -156,6 +166,12 @@ class Info(NamedTuple):
             raise ValueError(f"{error}{unit}") from None
         self.check(value)
         return value
+
+
+def check_size(name: str, value: int, least: int = 1) -> None:
+    """Raises ValueError where a layer's size is below `least` or so large that a typing error is likelier."""
+    if not least <= value <= MOST_UNITS:
+        raise ValueError(f"{name} must be at least {least} and at most {MOST_UNITS}")
 
 
 def split(text: str) -> tuple[str, dict[str, str]]:
@@ -211,8 +227,8 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
         flag: names the flag in errors, without dashes.
 
     Returns:
-        The Spec. Options have their default's type; numbers are finite, and not negative unless the
-        default is.
+        The Spec. Options have their default's type; numbers are within `LIMITS`, and not negative
+        unless the default is.
 
     Raises:
         SpecError: unknown name or option, wrong type, out of range, or not the syntax; one line.
@@ -242,6 +258,11 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
         is_number = type(default) in (int, float)
         if is_number and options[key] < 0 <= default:
             raise SpecError(f"{where}: {key}={value} must not be negative (default {value_text(default)})")
+        if is_number:
+            try:
+                Info(type(default), "").check(options[key])
+            except ValueError as error:
+                raise SpecError(f"{where}: {key}={value} {error}") from None
     options = {key: options[key] for key in defaults if key in options}
     return Spec(name, options, {**defaults, **options}, flag)
 

@@ -15,6 +15,7 @@ import signal
 import msgpack
 import numpy as np
 import pytest
+from flax import serialization
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -537,6 +538,8 @@ def file(name):
         lambda m: {**m, "files": ["params.msgpack"]},
         lambda m: {**m, "files": {"params.msgpack": "0"}},
         lambda m: {**m, "files": {"params.msgpack": {"bytes": 1}}},
+        lambda m: {**m, "format": True},
+        lambda m: {**m, "env_steps": 2**31},
         lambda m: {**m, "config": {**m["config"], "mode": "none"}},
         lambda m: {**m, "config": {**m["config"], "lr_rl": 10**400}},
         lambda m: {**m, "config": [m["config"]]},
@@ -675,6 +678,21 @@ def test_numbers_are_finite(copy, text):
     replace(copy, "run.json", f'{{"x": {text}}}'.encode())
     with pytest.raises(ConfigError, match="run.json: damaged"):
         checkpoint.load_numbers(whole(copy))
+
+
+@pytest.mark.parametrize(
+    "leaf", [3, 0.5, "text", None, [0.0], np.float32(1), {5: np.zeros(2, np.float32)}], ids=repr
+)
+def test_only_named_arrays_are_parameters(copy, leaf):
+    tree = {"encoder": {"kernel": leaf}, "heads": {}}
+    replace(copy, "params.msgpack", serialization.msgpack_serialize(tree))
+    with pytest.raises(ConfigError, match="params.msgpack"):
+        checkpoint.load(whole(copy))
+
+
+def test_a_name_that_no_file_can_have_is_refused():
+    with pytest.raises(ConfigError, match="no checkpoint there"):
+        checkpoint.read_manifest("x" * 5000)
 
 
 def test_parameters_of_another_form_are_refused_by_name():

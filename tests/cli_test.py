@@ -164,6 +164,15 @@ BAD = [
     (["--steps"], "--steps", ""),
     (["--gane=Pong"], "--gane", "did you mean --game?"),
     (["Pong"], "'Pong'", "--name=value"),
+    (["--notensorboard=1"], "--notensorboard=1", "argument"),
+    (["--flagfile=/dev/zero"], "--flagfile", "write the flags themselves"),
+    (["--steps=3000000000"], "--steps=3000000000", "at most 2147483647 (env steps)"),
+    (["--rl=rainbow:alpha=2"], "--rl=rainbow:alpha=2", "alpha must be at most 1"),
+    (["--rl=rainbow:v_max=1e39"], "--rl=rainbow:v_max=1e39", "at most 3.402823466e+38"),
+    (["--encoder=tiny:features=100000"], "--encoder=tiny:features=100000", "at most 65536"),
+    (["--out=a\nb"], "--out=a b", "'\\n'; name it with printable ones"),
+    (["--game=\x1b[31m"], "--game=\\x1b[31m", "valid: Alien"),
+    (["--mode=" + "x" * 10_000], "--mode=xxx", " [...] "),
 ]
 
 

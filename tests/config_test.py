@@ -12,6 +12,7 @@ from srl_jax import config as config_module
 from srl_jax import modes
 from srl_jax.config import INFOS, Config, resolve
 from srl_jax.errors import ConfigError
+from srl_jax.specs import LIMITS
 
 
 def _rl(context, *, n_step: int = 3, alpha: float = 0.5):
@@ -51,10 +52,15 @@ def _values(name, info):
     if info.kind is str:
         return st.text(max_size=8)
     if info.kind is int:
-        return st.integers(info.minimum, info.maximum)
+        return st.integers(info.minimum, info.maximum or LIMITS[int])
     low = info.above if info.minimum is None else info.minimum
+    low = -LIMITS[float] if low is None else low
     values = st.floats(
-        low, info.maximum, exclude_min=info.above is not None, allow_nan=False, allow_infinity=False
+        low,
+        info.maximum or LIMITS[float],
+        exclude_min=info.above is not None,
+        allow_nan=False,
+        allow_infinity=False,
     )
     return values | st.none() if info.optional else values
 
@@ -110,6 +116,10 @@ def test_every_number_is_limited(name):
         ({"objectives": (1,)}, "--objective=(1,): not of type tuple"),
         ({"game": "Catch", "frame_size": 50}, "--frame_size=50: --game=Catch knows 42 and 84"),
         ({"buffer_size": 20}, "--batch_size=32: must be at most --buffer_size=20"),
+        ({"steps": 2**31}, "--steps=2147483648: must be at most 2147483647"),
+        ({"lr_rl": 1e39}, "--lr_rl=1e+39: must be at most 3.402823466e+38"),
+        ({"adam_eps": 1e-50}, "--adam_eps=1e-50: must be at least 1e-37"),
+        ({"num_envs": 10_001}, "--num_envs=10001: must be at most 10000"),
         ({"learn_start": 100_001}, "--learn_start=100001: must be at most --buffer_size=100000"),
     ],
 )
@@ -127,6 +137,10 @@ def test_values_that_are_refused(values, message):
         ('{"gmae": "Pong"}', "did you mean game?"),
         ('{"steps": 1.5}', "--steps=1.5"),
         ('{"gamma": NaN}', "--gamma=nan"),
+        ('{"gamma": 1' + "0" * 400 + "}", "--gamma=1000"),
+        ('{"seed": 1, "seed": 2}', "'seed' is there twice"),
+        ("[" * 100_000, "nested too deeply"),
+        (b'{"game": "\xff"}', "not JSON"),
     ],
 )
 def test_json_that_is_refused(text, message):

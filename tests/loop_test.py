@@ -1,6 +1,8 @@
 """The loop: schedules, files and reproducibility of whole short runs on Catch."""
 
 import json
+import re
+import shutil
 import time
 from types import SimpleNamespace
 
@@ -203,6 +205,24 @@ def test_pretraining_on_a_given_policy_and_on_a_random_one(joint, tmp_path):
     config = Config(**SMALL, mode="pretrain", objectives=("inverse",), policy_from=str(tmp_path / "random"))
     with pytest.raises(ConfigError, match="has no policy"):
         checkpoint.check_sources(config)
+
+
+def test_a_buffer_that_cannot_be_is_refused():
+    # 4 environments, and windows of 4 + 3 frames, a slot being written and a spare one: 36.
+    small = Config(**{**SMALL, "buffer_size": 35, "learn_start": 0})
+    with pytest.raises(ConfigError, match="--buffer_size=35: capacity must be at least 36, got 35"):
+        loop.Run(small, None, False)
+
+
+def test_a_checkpoint_that_asks_for_what_there_is_not_is_refused_by_its_name(joint, tmp_path):
+    path, _ = joint
+    shutil.copytree(path, tmp_path / "copy")
+    manifest = checkpoint.read_manifest(tmp_path / "copy").path / "manifest.json"
+    values = json.loads(manifest.read_text())
+    for change, reason in (({"rl": "x"}, "no 'x'"), ({"encoder": "tiny:features=0"}, "features must be")):
+        manifest.write_text(json.dumps({**values, "config": {**values["config"], **change}}))
+        with pytest.raises(ConfigError, match=f"^{re.escape(str(manifest.parent))}.*{reason}"):
+            loop.load_agent(tmp_path / "copy")
 
 
 def test_an_encoder_that_does_not_fit_is_refused(joint):

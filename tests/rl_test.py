@@ -278,7 +278,11 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
         ({"hidden": 0}, "hidden"),
         ({"atoms": 1}, "atoms"),
         ({"v_min": 1.0, "v_max": 1.0}, "v_min must be below v_max"),
-        ({"init_std": -1.0}, "init_std must be at least 0"),
+        ({"init_std": -1.0}, "init_std must be 0 or at least 0.001"),
+        ({"init_std": 1e-30}, "init_std must be 0 or at least 0.001"),
+        ({"alpha": 1.5}, "alpha must be at most 1"),
+        ({"hidden": 2**16 + 1}, "hidden must be at least 1 and at most 65536"),
+        ({"atoms": 2**31 - 1}, "atoms must be at least 2 and at most 65536"),
     ],
 )
 def test_options_that_cannot_be_are_refused(options, message):

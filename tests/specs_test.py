@@ -3,6 +3,7 @@
 import functools
 
 import hypothesis
+import numpy as np
 import pytest
 from hypothesis import strategies as st
 
@@ -44,9 +45,9 @@ def test_defaults_are_resolved_and_those_of_a_partial_win():
     options=st.fixed_dictionaries(
         {},
         optional={
-            "weight": st.floats(0, allow_infinity=False),
-            "n_step": st.integers(0),
-            "low": st.floats(allow_nan=False, allow_infinity=False),
+            "weight": st.floats(0, specs.LIMITS[float]),
+            "n_step": st.integers(0, specs.LIMITS[int]),
+            "low": st.floats(-specs.LIMITS[float], specs.LIMITS[float]),
             "noisy": st.booleans(),
             "kind": st.text("abc=:. _", max_size=5).map(str.strip),
         },
@@ -87,6 +88,10 @@ def test_the_canonical_text_gives_the_same_spec(options):
         ("sum:low=-inf", ["not a finite number"]),
         ("sum:weight=-1", ["must not be negative"]),
         ("sum:n_step=-1", ["must not be negative"]),
+        # Beyond 32 bits, which devices count and compute in.
+        ("sum:n_step=2147483648", ["must be at most 2147483647"]),
+        ("sum:weight=1e39", ["must be at most 3.402823466e+38"]),
+        ("sum:low=-1e39", ["must be at least -3.402823466e+38"]),
     ],
 )
 def test_an_error_is_one_line_that_names_the_flag_and_what_is_valid(text, parts):
@@ -146,3 +151,20 @@ def test_limits():
     with pytest.raises(ValueError, match="did you mean slow"):
         specs.Info(str, "help", choices=("slow", "online")).parse("slwo")
     assert specs.Info(float, "help", optional=True).parse("off") is None
+
+
+@pytest.mark.parametrize("limit", [specs.LIMITS[int], -specs.LIMITS[int]])
+def test_whole_numbers_have_32_bits(limit):
+    info = specs.Info(int, "help")
+    assert info.parse(str(limit)) == limit
+    with pytest.raises(ValueError, match=f"{limit}$"):
+        info.parse(str(limit + (1 if limit > 0 else -1)))
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+def test_other_numbers_have_single_precision(sign):
+    limit = sign * float(np.finfo(np.float32).max)
+    info = specs.Info(float, "help")
+    assert info.parse(repr(limit)) == limit
+    with pytest.raises(ValueError, match="3.402823466e.38$"):
+        info.parse(repr(float(np.nextafter(limit, sign * np.inf))))

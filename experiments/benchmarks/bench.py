@@ -53,6 +53,8 @@ def chosen_rows(only: list[str] | None) -> list[str]:
     Raises:
         ConfigError: there is no such row.
     """
+    if only == []:
+        raise ConfigError(f"--only=: names no row; {choices_text('', ROWS)}")
     for name in only or []:
         if name not in ROWS:
             raise ConfigError(f"--only={name}: {choices_text(name, ROWS)}")

@@ -17,6 +17,7 @@ from experiments import flags as config_flags
 from experiments.benchmarks.bench import check_out
 from srl_jax.config import versions
 from srl_jax.errors import ConfigError
+from srl_jax.specs import Info
 
 FLAGS = flags.FLAGS
 NATURE, JOINT = "thesis/rl_only_nature", "thesis/joint_256"
@@ -25,11 +26,10 @@ NATURE, JOINT = "thesis/rl_only_nature", "thesis/joint_256"
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_enum("device", "gpu", ["gpu", "cpu"], "cpu: only to try this program", flag_values=values)
-    flags.DEFINE_integer("updates", 500, "updates timed for each figure", flag_values=values)
-    flags.DEFINE_integer("seeds", 8, "seeds in one process", flag_values=values)
-    flags.DEFINE_float(
-        "seconds", 180.0, "length of the run that 5M env steps follow from", flag_values=values
-    )
+    config_flags.define("updates", Info(int, "updates timed for each figure", minimum=1), 500, values)
+    config_flags.define("seeds", Info(int, "seeds in one process", minimum=1, maximum=1_000), 8, values)
+    seconds = Info(float, "length of the run that 5M env steps follow from", "s", above=0)
+    config_flags.define("seconds", seconds, 180.0, values)
     flags.DEFINE_string("out", None, "directory for gpu.json; must be new or empty", flag_values=values)
 
 

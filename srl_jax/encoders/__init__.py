@@ -4,6 +4,7 @@
 """
 
 from srl_jax.encoders.convolutional import Layer, convolutional_encoder
+from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
 __all__ = ["REGISTRY", "nature", "sac_ae", "tiny"]
@@ -26,10 +27,9 @@ def sac_ae(observation_shape: tuple, *, features: int = 256, layer_norm: bool = 
         layer_norm: LayerNorm before the tanh (in the thesis' code, not in its text).
 
     Raises:
-        ValueError: where features is 0 or the frames are too small.
+        ValueError: where features is out of range or the frames are too small.
     """
-    if features < 1:
-        raise ValueError("features must be at least 1")
+    check_size("features", features)
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
     return convolutional_encoder(observation_shape, layers, features=features, layer_norm=layer_norm)
 
@@ -38,10 +38,9 @@ def tiny(observation_shape: tuple, *, features: int = 64) -> Encoder:
     """A small encoder for tests and for Catch: two convolutions and a bottleneck.
 
     Raises:
-        ValueError: where features is 0 or the frames are too small.
+        ValueError: where features is out of range or the frames are too small.
     """
-    if features < 1:
-        raise ValueError("features must be at least 1")
+    check_size("features", features)
     layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
     return convolutional_encoder(observation_shape, layers, features=features)
 

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.layers import Dense
+from srl_jax.specs import check_size
 from srl_jax.types import Array, Context, Latents, Objective, Window
 
 
@@ -31,10 +32,9 @@ def inverse(context: Context, *, weight: float = 1.0, hidden: int = 256) -> Obje
     The gradient flows into the head and, through both latents, into the encoder.
 
     Raises:
-        ValueError: where hidden is 0.
+        ValueError: where hidden is out of range.
     """
-    if hidden < 1:
-        raise ValueError("hidden must be at least 1")
+    check_size("hidden", hidden)
     network = InverseHead(context.num_actions, hidden)
     z = jnp.zeros((1, context.encoder.features))
 

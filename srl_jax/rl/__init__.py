@@ -11,6 +11,7 @@ import numpy as np
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.losses import categorical_q_learning, categorical_target, entropy, huber, q_learning
 from srl_jax.rl.losses import n_step as n_step_view
+from srl_jax.specs import check_size
 from srl_jax.types import Context, Latents, Objective, Window
 
 __all__ = ["REGISTRY", "Algorithm", "normal_logits", "rainbow"]
@@ -68,19 +69,20 @@ def rainbow(
         hidden: width of each stream's hidden layer.
 
     Raises:
-        ValueError: where n_step or hidden is 0, atoms is below 2, v_min is not below v_max, or init_std is
-            below 0.
+        ValueError: where n_step is 0, hidden or atoms is out of range, v_min is not below v_max, init_std is
+            too small for float32, or alpha is above 1.
     """
     if n_step < 1:
         raise ValueError("n_step must be at least 1")
-    if hidden < 1:
-        raise ValueError("hidden must be at least 1")
-    if distributional and atoms < 2:
-        raise ValueError("atoms must be at least 2")
+    check_size("hidden", hidden)
+    if distributional:
+        check_size("atoms", atoms, least=2)
     if distributional and v_min >= v_max:
         raise ValueError(f"v_min must be below v_max, not {v_min} and {v_max}")
-    if init_std < 0:
-        raise ValueError("init_std must be at least 0")
+    if init_std and not init_std >= 1e-3:
+        raise ValueError("init_std must be 0 or at least 0.001")
+    if alpha > 1:
+        raise ValueError("alpha must be at most 1")
     support = np.linspace(v_min, v_max, atoms, dtype=np.float32) if distributional else None
     prior = normal_logits(support, init_std) if distributional and init_std else None
     network = QNetwork(

@@ -1,0 +1,67 @@
+"""Files that somebody else may have written, read as data. Imports no jax."""
+
+import errno
+import json
+import os
+import stat
+from collections.abc import Callable
+from typing import Any
+
+SETTINGS = 1 << 24
+"""Bytes that a config.json or a manifest may have."""
+ROWS = 1 << 30
+"""Bytes that a metrics.jsonl may have."""
+
+
+def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
+    """The content of a regular file. A pipe is not waited for, and no device is read.
+
+    Args:
+        path: of the file, or of a link to it.
+        limit: the bytes that it may have.
+
+    Raises:
+        OSError: there is no such file, it is not a regular one, or too large; `strerror` says which.
+    """
+    path = os.fspath(path)
+    try:
+        mode = os.stat(path).st_mode
+        if stat.S_ISDIR(mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), path)
+        if not stat.S_ISREG(mode):
+            raise OSError(errno.EINVAL, "Not a regular file", path)
+        with open(path, "rb") as file:
+            size = os.fstat(file.fileno()).st_size
+            data = file.read(size + 1) if size <= limit else None
+    except MemoryError:
+        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM), path) from None
+    except ValueError as error:  # a NUL in the path
+        raise OSError(errno.EINVAL, str(error), path) from None
+    if data is None or len(data) > limit:
+        raise OSError(errno.EFBIG, f"File larger than {limit} bytes", path)
+    return data
+
+
+def parse_json(data: bytes | str, constant: Callable[[str], Any] | None = None) -> Any:
+    """Reads one JSON document, in UTF-8 where it is bytes.
+
+    Args:
+        data: the document.
+        constant: takes "NaN", "Infinity" or "-Infinity"; None reads them as numbers.
+
+    Raises:
+        ValueError: it is none, an object has a key twice, or it is nested too deeply for Python's reader.
+    """
+    try:
+        text = data if isinstance(data, str) else data.decode("utf-8")
+        return json.loads(text, object_pairs_hook=_object, parse_constant=constant)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    found = dict(pairs)
+    if len(found) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise ValueError(f"{max(names, key=names.count)!r} is there twice")
+    return found
