@@ -16,7 +16,7 @@ VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2
 STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 
 .DEFAULT_GOAL := help
-.PHONY: help install test train lint bench bench-gpu bench-install
+.PHONY: help install test train lint soak bench bench-gpu bench-install
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
@@ -46,6 +46,10 @@ train: install ## train on Pong for about three minutes (two cores), into a new 
 
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .
+
+soak: install ## try to break what is promised about killed runs, disks and inputs (an hour)
+	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[soak]'
+	@$(VENV)/bin/python -m experiments.soak $(ARGS)
 
 bench: install ## time this project beside PyTorch and Tianshou, and print a table (ten minutes)
 	@$(VENV)/bin/python -m experiments.benchmarks.bench $(ARGS)

@@ -9,13 +9,15 @@ import json
 import tempfile
 import time
 from pathlib import Path
+from typing import NamedTuple
 
 from absl import flags
 
 from experiments import flags as config_flags
 from experiments.soaking import Count
-from srl_jax.config import git_revision, versions
+from srl_jax.config import git_revision
 from srl_jax.errors import ConfigError
+from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text
 
 FLAGS = flags.FLAGS
@@ -39,17 +41,66 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
         "only", None, f"parts to run, of {', '.join(PARTS)}; all if not given", flag_values=values
     )
     flags.DEFINE_boolean("short", False, "the short versions, a minute in all", flag_values=values)
-    flags.DEFINE_string("out", None, "new directory for soak.md and soak.json", flag_values=values)
+    flags.DEFINE_string(
+        "out", None, "directory for soak.md and soak.json; other parts there stay", flag_values=values
+    )
 
 
-def table(counts: dict[str, list[Count]], seconds: dict[str, float]) -> str:
+class Result(NamedTuple):
+    """Of one part.
+
+    Attributes:
+        revision: of the project, None where it is not known.
+        short: whether it was the short version.
+        seconds: it took.
+        counts: its lines of the table.
+    """
+
+    revision: str | None
+    short: bool
+    seconds: float
+    counts: list[Count]
+
+
+def table(results: dict[str, Result]) -> str:
     """Markdown."""
     lines = ["| part | tried | times | failed | |", "|---|---|---|---|---|"]
-    for part, rows in counts.items():
-        for row in rows:
+    notes = []
+    for part in sorted(results, key=list(PARTS).index):
+        found = results[part]
+        for row in found.counts:
             lines.append(f"| {part} | {row.what} | {row.number:,} | {row.failed:,} | {row.detail} |")
-    took = ", ".join(f"{part} {value / 60:.1f}" for part, value in seconds.items())
-    return "\n".join(lines) + f"\n\nMinutes: {took}.\n"
+        short = ", short" if found.short else ""
+        notes.append(f"{part} {found.seconds / 60:.1f} minutes ({str(found.revision)[:7]}{short})")
+    return "\n".join(lines) + "\n\n" + ", ".join(notes) + ".\n"
+
+
+def read(out: Path) -> dict[str, Result]:
+    """What soak.json holds; nothing where there is none.
+
+    Raises:
+        ConfigError: the directory has something else.
+    """
+    if not out.is_dir() or not any(out.iterdir()):
+        return {}
+    try:
+        content = parse_json(read_bytes(out / "soak.json", SETTINGS))
+        return {
+            part: Result(**{**x, "counts": [Count(**row) for row in x["counts"]]})
+            for part, x in content.items()
+        }
+    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        raise ConfigError(f"--out={out}: not empty and without a soak.json; name a new directory") from None
+
+
+def write(out: Path, results: dict[str, Result]) -> None:
+    """soak.md and soak.json."""
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "soak.md").write_text(table(results), encoding="utf-8")
+    content = {
+        part: {**x._asdict(), "counts": [row._asdict() for row in x.counts]} for part, x in results.items()
+    }
+    (out / "soak.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def chosen(only: list[str] | None) -> list[str]:
@@ -69,35 +120,22 @@ def main(argv: list[str]) -> int:
     del argv
     parts = chosen(FLAGS.only)
     out = config_flags.check_place("out", FLAGS.out) if FLAGS.out else None
-    if out is not None and out.is_dir() and any(out.iterdir()):
-        raise ConfigError(f"--out={FLAGS.out}: not empty; name a new directory")
-    counts, seconds = {}, {}
+    results = read(out) if out else {}
+    for part in parts:
+        if part in results:
+            raise ConfigError(
+                f"--out={FLAGS.out}: has {part} already; name a new directory, or others with --only"
+            )
     for part in parts:
         soak = importlib.import_module(f"experiments.soaking.{part}").soak
-        began = time.monotonic()
+        began, revision = time.monotonic(), git_revision()
         with tempfile.TemporaryDirectory(prefix=f"soak_{part}_") as folder:
-            counts[part] = soak(FLAGS.short, Path(folder), lambda line: print(line, flush=True))
-        seconds[part] = time.monotonic() - began
+            counts = soak(FLAGS.short, Path(folder), lambda line: print(line, flush=True))
+        results[part] = Result(revision, FLAGS.short, round(time.monotonic() - began, 1), counts)
         if out is not None:  # after each part, so that what was found is not lost
-            write(out, counts, seconds)
-    print(table(counts, seconds), end="")
-    return int(any(row.failed for rows in counts.values() for row in rows))
-
-
-def write(out: Path, counts: dict[str, list[Count]], seconds: dict[str, float]) -> None:
-    """soak.md and soak.json."""
-    out.mkdir(parents=True, exist_ok=True)
-    revision = git_revision()
-    head = f"`python -m experiments.soak`{' --short' if FLAGS.short else ''}, revision {revision}.\n\n"
-    (out / "soak.md").write_text(head + table(counts, seconds), encoding="utf-8")
-    content = {
-        "revision": revision,
-        "versions": versions(),
-        "short": FLAGS.short,
-        "seconds": seconds,
-        "counts": {part: [row._asdict() for row in rows] for part, rows in counts.items()},
-    }
-    (out / "soak.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+            write(out, results)
+    print(table(results), end="")
+    return int(any(row.failed for part in parts for row in results[part].counts))
 
 
 if __name__ == "__main__":

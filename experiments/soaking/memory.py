@@ -26,7 +26,7 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
     """See the module."""
     from srl_jax.loop import Run
 
-    steps = 6_000 if short else 60_000
+    steps = 2_000 if short else 60_000
     folder = folder / "run"
     folder.mkdir()
     values = {"steps": steps, "log_every": steps, "checkpoint_every": steps // 6, "eval_every": steps // 5}
