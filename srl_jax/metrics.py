@@ -180,7 +180,8 @@ def _parse(line: bytes) -> dict[str, Any]:
 def _cut(path: Path, mark: Mark) -> None:
     try:
         with open(path, "r+b") as file:
-            if hashlib.sha256(file.read(mark.bytes)).hexdigest() != mark.sha256:
+            size = os.fstat(file.fileno()).st_size
+            if size < mark.bytes or hashlib.sha256(file.read(mark.bytes)).hexdigest() != mark.sha256:
                 raise ConfigError(f"{path}: does not begin with the rows that the checkpoint knows")
             file.truncate(mark.bytes)
     except OSError as error:

@@ -1,3 +1,4 @@
+import hashlib
 import json
 import sys
 
@@ -7,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax.metrics import MetricsWriter, read_metrics, strip_wall
+from srl_jax.metrics import Mark, MetricsWriter, read_metrics, strip_wall
 
 
 def lines(path):
@@ -116,6 +117,26 @@ def test_a_file_cut_anywhere_reads_up_to_the_cut_and_can_be_continued(tmp_path):
         assert [row["env_steps"] for row in read_metrics(path)] == [*range(whole), 9]
 
 
+def test_a_file_is_cut_back_to_a_mark_and_continued(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    marks = []
+    with MetricsWriter(path) as writer:
+        for step in range(4):
+            marks.append(writer.mark())
+            writer.write("train", step, 0, 0.0, {"x": step / 3})
+    data = path.read_bytes()
+    assert marks[0] == Mark(0, hashlib.sha256(b"").hexdigest())
+    for step, mark in reversed(list(enumerate(marks))):
+        assert mark.sha256 == hashlib.sha256(data[: mark.bytes]).hexdigest()
+        path.write_bytes(data[: -step or None])  # a killed process may have been anywhere in a line
+        with MetricsWriter(path, mark=mark) as writer:
+            assert writer.mark() == mark
+            for later in range(step, 4):
+                assert writer.mark() == marks[later]
+                writer.write("train", later, 0, 0.0, {"x": later / 3})
+        assert path.read_bytes() == data
+
+
 @pytest.mark.parametrize("line", ["{", '{"x": NaN}', "[1]", ""])
 def test_a_damaged_line_before_the_last_is_named(tmp_path, line):
     path = tmp_path / "metrics.jsonl"
@@ -130,21 +151,37 @@ def test_strip_wall_removes_what_the_clock_decides_and_nothing_else():
     assert "wall_s" in row
 
 
-def test_tensorboard_gets_the_scalars(tmp_path):
-    pytest.importorskip("tensorboardX")
+def events(file):
     from tensorboardX.proto.event_pb2 import Event
 
+    data, found = file.read_bytes(), []
+    while data:  # a record: length (8 bytes), its checksum (4), the event, its checksum (4)
+        length = int.from_bytes(data[:8], "little")
+        found.append(Event.FromString(data[12 : 12 + length]))
+        data = data[16 + length :]
+    return found
+
+
+def test_tensorboard_gets_the_scalars(tmp_path):
+    pytest.importorskip("tensorboardX")
     values = {"loss/rl": np.float32(0.5), "eval/returns": [1.0, 2.0], "note": "x"}
     with MetricsWriter(tmp_path / "metrics.jsonl", tmp_path / "events") as writer:
         writer.write("train", 320, 1, 0.0, values)
     (file,) = (tmp_path / "events").iterdir()
-    data, found = file.read_bytes(), []
-    while data:  # a record: length (8 bytes), its checksum (4), the event, its checksum (4)
-        length = int.from_bytes(data[:8], "little")
-        event = Event.FromString(data[12 : 12 + length])
-        found += [(event.step, v.tag, v.simple_value) for v in event.summary.value]
-        data = data[16 + length :]
+    found = [(e.step, v.tag, v.simple_value) for e in events(file) for v in e.summary.value]
     assert found == [(320, "loss/rl", 0.5)]
+
+
+def test_tensorboard_hides_what_a_run_had_written_after_the_mark(tmp_path):
+    pytest.importorskip("tensorboardX")
+    with MetricsWriter(tmp_path / "metrics.jsonl", tmp_path / "first") as writer:
+        mark = writer.mark()
+        writer.write("train", 400, 1, 0.0, {})
+    with MetricsWriter(tmp_path / "metrics.jsonl", tmp_path / "second", mark, 320):
+        pass
+    (file,) = (tmp_path / "second").iterdir()
+    starts = [e.step for e in events(file) if e.WhichOneof("what") == "session_log"]
+    assert starts == [321]  # TensorBoard drops events of the other files from this step on
 
 
 def test_missing_tensorboard_names_the_extra_and_writes_nothing(tmp_path, monkeypatch):

@@ -1,0 +1,272 @@
+"""srl_jax/reporting.py: means of updates, and rows that go on as if nobody had stopped."""
+
+import json
+import shutil
+
+import jax
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from srl_jax import reporting
+from srl_jax.errors import ConfigError, SaveError
+from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.reporting import FOLD_EVERY, Means, Report
+
+
+def same(rows):
+    """A fetch for metrics that are on the host as it is."""
+    return rows
+
+
+def one_by_one(rows, name):
+    """The mean as it is defined: float64 sums in the order of the updates, then one division."""
+    total, count = 0.0, 0
+    for row in rows:
+        if name in row and not (name.startswith("grad_norm/") and np.isnan(row[name])):
+            total, count = total + float(row[name]), count + 1
+    return np.float32(total / count)
+
+
+def make_rows(number, seed=0):
+    """Updates of which every third measures a representation's loss, and every fifth a norm."""
+    rng = np.random.default_rng(seed)
+    rows = []
+    for i in range(number):
+        row = {"loss/rl": np.float32(rng.lognormal(sigma=8)), "loss/total": np.float32(rng.normal())}
+        row["grad_norm/encoder"] = np.float32(rng.normal() if i % 5 == 0 else np.nan)
+        if i % 3 == 0:
+            row["loss/inverse"] = np.float32(rng.normal())
+        rows.append(row)
+    return rows
+
+
+def bits(means):
+    return {name: (x.dtype, x.tobytes()) for name, x in means.items()}
+
+
+@given(st.integers(1, 3 * FOLD_EVERY + 7), st.sets(st.integers(0, 3 * FOLD_EVERY)))
+def test_means_are_sums_in_order_wherever_they_are_folded(number, looks):
+    rows = make_rows(number, seed=number)
+    means = Means(same)
+    for i, row in enumerate(rows):
+        means.add(row)
+        if i in looks:  # a look folds; so does a snapshot, from which another one goes on
+            assert means.broken() is None
+            text = json.dumps(means.snapshot(), allow_nan=False)
+            means = Means(same)
+            means.restore(json.loads(text))
+    names = {name for row in rows for name in row}
+    assert bits(means.take()) == bits({name: one_by_one(rows, name) for name in names})
+    assert means.take() == {}  # anew
+
+
+def test_means_keep_no_more_than_a_hundred_updates_and_look_no_more_often(monkeypatch):
+    asked = []
+    means = Means(lambda rows: asked.append(len(rows)) or rows)
+    for row in make_rows(5 * FOLD_EVERY + 1):
+        means.add(row)
+        assert len(means._waiting) < FOLD_EVERY
+    assert asked == [FOLD_EVERY] * 5
+
+
+def test_means_of_device_arrays():
+    means = Means(jax.device_get)
+    for x in (1.0, 2.0, 4.5):
+        means.add({"loss/rl": jax.numpy.float32(x)})
+    assert means.take() == {"loss/rl": np.float32(2.5)}
+
+
+def test_a_norm_that_was_not_measured_is_left_out():
+    means = Means(same)
+    for norm in (np.nan, 3.0, np.nan, 5.0):
+        means.add({"grad_norm/encoder": np.float32(norm), "loss/rl": np.float32(1)})
+    assert means.broken() is None
+    assert means.take() == {"grad_norm/encoder": 4.0, "loss/rl": 1.0}
+    means.add({"grad_norm/encoder": np.float32(np.nan)})
+    assert means.take() == {}
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("at", [0, 7, FOLD_EVERY + 3])
+def test_a_loss_that_is_not_finite_is_named(bad, at):
+    means = Means(same)
+    for i in range(2 * FOLD_EVERY + 2):
+        assert i > at or means.broken() is None
+        losses = {"loss/total": 1.0, "loss/a": 1.0, "rl/q": np.inf}
+        if i == at:
+            losses |= {"loss/a": bad, "loss/total": bad}
+        means.add({name: np.float32(x) for name, x in losses.items()})
+    assert means.broken() == "loss/a"  # the part, not the total that it is in
+    means.add({"loss/a": np.float32(-np.inf)})  # inf - inf
+    assert means.broken() == "loss/a"
+    means.take()
+    means.add({"loss/total": np.float32(bad)})
+    assert means.broken() == "loss/total"
+
+
+def test_snapshots_of_means_are_exact():
+    means = Means(same)
+    values = {"rl/q": np.inf, "rl/nan": np.nan, "rl/low": -np.inf, "loss/rl": 0.1, "loss/a": 1e-45}
+    for _ in range(3):
+        means.add({name: np.float32(x) for name, x in values.items()})
+    other = Means(same)
+    other.restore(json.loads(json.dumps(means.snapshot(), allow_nan=False)))
+    assert other.snapshot() == means.snapshot()
+    assert bits(other.take()) == bits(means.take())
+
+
+# Rows
+
+
+def report(out):
+    out.mkdir(exist_ok=True)
+    return Report(out, 1000, same, progress=False, tensorboard=False)
+
+
+def go_on(one, first, last):
+    """Steps of a run that has a row after every fourth step, and episodes that end now and then."""
+    rows = make_rows(40)
+    for step in range(first, last):
+        one.means.add(rows[step])
+        if step % 3 == 0:
+            one.ended(np.array([step / 7, -1.0]))
+        if step % 4 == 3:
+            one.train_row(10 * (step + 1), step, {"epsilon": step / 9})
+        if step % 8 == 7:
+            one.eval_row(10 * (step + 1), step, {"eval/return_mean": step / 3})
+
+
+def stripped(out):
+    return [strip_wall(row) for row in read_metrics(out / "metrics.jsonl")]
+
+
+@pytest.mark.parametrize("stop", range(0, 12))
+@pytest.mark.parametrize("later", [0, 1, 9])
+def test_rows_after_a_snapshot_are_those_that_would_have_been(tmp_path, stop, later):
+    whole = report(tmp_path / "whole")
+    with whole:
+        go_on(whole, 0, 24)
+    killed = report(tmp_path / "killed")
+    with killed:
+        go_on(killed, 0, stop)
+        snapshot = json.loads(json.dumps(killed.snapshot(), allow_nan=False))
+        go_on(killed, stop, stop + later)  # what it wrote after its last checkpoint
+    with open(tmp_path / "killed" / "metrics.jsonl", "ab") as file:
+        file.write(b'{"kind": "tr')
+    again = report(tmp_path / "killed")
+    again.restore(snapshot, 10 * stop)
+    with again:
+        go_on(again, stop, 24)
+    rows = stripped(tmp_path / "killed")
+    assert rows == stripped(tmp_path / "whole")
+    assert [row["env_steps"] for row in rows if row["kind"] == "train"] == [40, 80, 120, 160, 200, 240]
+    # By hand: before the first row, steps 0 and 3 ended two episodes each.
+    assert rows[0]["train/episodes"] == 4
+    assert rows[0]["train/return_mean"] == pytest.approx((0 + 3 / 7 - 2) / 4)
+
+
+def test_the_clock_goes_on_where_it_was(tmp_path, monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(reporting.time, "perf_counter", lambda: now[0])
+    first = report(tmp_path / "run")
+    with first:
+        now[0] += 8
+        first.train_row(400, 0, {})
+        now[0] += 2
+        snapshot = first.snapshot()
+    now[0] = 5000.0  # another process, another clock
+    second = report(tmp_path / "run")
+    second.restore(snapshot, 500)
+    with second:
+        assert second.seconds == 10
+        now[0] += 3
+        second.train_row(700, 0, {})
+    rows = read_metrics(tmp_path / "run" / "metrics.jsonl")
+    # 400 env steps in 8 s; then 300 in 2 + 3 s.
+    assert [(row["wall_s"], row["wall_steps_per_s"]) for row in rows] == [(8, 50), (13, 60)]
+
+
+@pytest.mark.parametrize("change", ["other", "shorter", "missing", "directory"])
+def test_metrics_that_the_checkpoint_does_not_know_are_left_alone(tmp_path, change):
+    first = report(tmp_path / "run")
+    with first:
+        go_on(first, 0, 9)
+        snapshot = first.snapshot()
+        go_on(first, 9, 20)
+    path = tmp_path / "run" / "metrics.jsonl"
+    data = path.read_bytes()
+    if change == "other":
+        data = data.replace(b"epsilon", b"Epsilon", 1)
+    elif change == "shorter":
+        data = data[: snapshot["metrics"]["bytes"] - 1]
+    path.write_bytes(data)
+    if change in ("missing", "directory"):
+        path.unlink()
+    if change == "directory":
+        path.mkdir()
+    second = report(tmp_path / "run")
+    second.restore(snapshot, 90)
+    with pytest.raises(ConfigError, match=f"{path}: .*the checkpoint knows") as error, second:
+        pass
+    assert "\n" not in str(error.value)
+    if change in ("other", "shorter"):
+        assert path.read_bytes() == data
+    else:
+        assert path.exists() == (change == "directory")
+
+
+def test_a_full_disk_is_a_save_error(tmp_path):
+    with pytest.raises(SaveError, match="metrics.jsonl: a row was not written: No space left") as error:
+        with report(tmp_path / "run") as one:
+            one._writer._file.close()
+            one._writer._file = open("/dev/full", "ab")
+            one.train_row(1, 1, {})
+    assert "\n" not in str(error.value)
+
+
+def test_what_cannot_be_flushed_is_a_save_error(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    with report(tmp_path / "run") as one:
+        monkeypatch.setattr("os.fsync", full)
+        with pytest.raises(SaveError, match="metrics.jsonl: not flushed: No space left"):
+            one.snapshot()
+
+
+def _changes(value):
+    """The value with one thing in it that is not what it should be."""
+    if isinstance(value, dict):
+        for name in value:
+            yield {n: v for n, v in value.items() if n != name}
+            yield from (value | {name: v} for v in _changes(value[name]))
+    elif isinstance(value, list):
+        yield value[:-1]
+        for i, item in enumerate(value):
+            yield from ([*value[:i], v, *value[i + 1 :]] for v in _changes(item))
+    yield from (None, "x", "nan", {}, [], [[1]], 10**400, 2**62, -1, 0)
+
+
+def test_a_snapshot_of_another_form_is_refused_at_once(tmp_path):
+    first = report(tmp_path / "run")
+    with first:
+        go_on(first, 0, 7)
+        snapshot = first.snapshot()
+    refused = 0
+    for changed in _changes(snapshot):
+        shutil.copytree(tmp_path / "run", tmp_path / "copy")
+        second = report(tmp_path / "copy")
+        try:
+            second.restore(changed, 70)
+        except (ValueError, KeyError, TypeError, AttributeError, OverflowError):
+            refused += 1
+        else:  # it could have been so: then all goes well, or the metrics are others
+            try:
+                with second:
+                    go_on(second, 7, 12)
+            except ConfigError as error:
+                assert "does not begin with the rows" in str(error)
+        shutil.rmtree(tmp_path / "copy")
+    assert refused > 80
