@@ -22,7 +22,7 @@ from experiments import runtime
 from experiments.directories import all_to_resume, check_out, run_directory
 from srl_jax.config import INFOS, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.rundir import held
+from srl_jax.rundir import check_free, held
 from srl_jax.specs import build, parse
 
 FLAGS = flags.FLAGS
@@ -167,6 +167,8 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     seeds = check_seeds(values)
     resume = values["resume"].value == "auto"
     path = check_out(values["out"].value, config, overwrite=values["overwrite"].value, resume=resume)
+    for directory in [path / f"seed{seed}" for seed in seeds] or [path]:
+        check_free(directory)
     check_extras(config)
     check_paths(config)
     if prepare is not None:
