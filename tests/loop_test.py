@@ -12,24 +12,7 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.update import Hyper
-
-SMALL = {
-    "game": "Catch",
-    "frame_size": 42,
-    "encoder": "tiny:features=8",
-    "rl": "rainbow:hidden=16,atoms=11,v_min=-2,v_max=2",
-    "num_envs": 4,
-    "buffer_size": 400,
-    "batch_size": 8,
-    "learn_start": 40,
-    "updates_per_step": 0.125,
-    "steps": 240,
-    "log_every": 40,
-    "eval_every": 120,
-    "eval_games": 3,
-    "slow_update_every": 5,
-}
-JOINT = {"mode": "joint", "objectives": ("reconstruction", "latent_l2")}
+from tests.helpers import JOINT, SMALL
 
 
 def train(path, **values):
