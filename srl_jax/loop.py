@@ -248,10 +248,8 @@ class Run:
                 self.write_train_row()
             if rows[1]:
                 self.start_evaluation(self.state.params, self.env_steps, self.updates)
-            if (
-                self.passed(before, config.checkpoint_every or config.eval_every)
-                and self.env_steps < config.steps
-            ):
+            if self.passed(before, self.checkpoint_every) and self.env_steps < config.steps:
+                self.keep_encoder()  # first: a run that goes on from the checkpoint does not write it again
                 self.save()
             self.report.progress.update(self.env_steps)
         self.finish_evaluation()
@@ -458,14 +456,19 @@ class Run:
             base=self.saved,
         )
         self.saved_position = self.replay.next_position.copy()
+
+    def keep_encoder(self) -> None:
+        """Writes the encoder, if the checkpoint that is due is one of every so many."""
         every = self.config.keep_encoder_every
         if every and self.env_steps // self.checkpoint_every % every == 0:
+            self.check_losses()
             self.save_parameters("encoders", {"encoder": self.state.params["encoder"], "heads": {}}, keep=0)
 
     def finish(self) -> None:
         """Writes the last checkpoint: of parameters alone, and leaves no more of the one before."""
         before = self.saved if self.saved and self.saved.env_steps < self.env_steps else None
         self.save_parameters("checkpoints", self.state.params, keep=2)
+        self.agent.agree(True)  # all seeds have theirs; until then, they can go on from the one before
         if before is not None:
             checkpoint.slim(before)
 

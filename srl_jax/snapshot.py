@@ -69,7 +69,7 @@ def put(run: "Run", manifest: Manifest) -> None:
     numbers = checkpoint.load_numbers(manifest)
     try:
         _put(run, manifest, numbers)
-    except (KeyError, TypeError, ValueError, IndexError, OverflowError) as error:
+    except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
         if isinstance(error, ConfigError):
             raise
         raise ConfigError(
@@ -104,7 +104,8 @@ def _put(run: "Run", manifest: Manifest, numbers: dict[str, Any]) -> None:
     replay = run.replay
     replay_arrays = group("replay_")
     positions = replay_arrays["next_position"]
-    if positions.shape != replay.next_position.shape or (positions < 0).any():
+    form = replay.next_position.shape, replay.next_position.dtype
+    if (positions.shape, positions.dtype) != form or (positions < 0).any():
         raise ValueError("next_position is not a position in each stream")
     replay.next_position[:] = positions
     for name, slots in chunks(replay):
@@ -117,7 +118,7 @@ def _put(run: "Run", manifest: Manifest, numbers: dict[str, Any]) -> None:
     if (numbers["env_steps"], numbers["updates"]) != (run.env_steps, run.updates):
         raise ValueError("env steps and updates are not the manifest's")
     score = np.array(numbers["score"], float)
-    if score.shape != run.score.shape:
+    if score.shape != run.score.shape or not np.isfinite(score).all():
         raise ValueError("a score is missing")
     run.score, run.solved = score, bool(numbers["solved"])
     run.report.restore(numbers["report"], run.env_steps)

@@ -17,6 +17,7 @@ from experiments.benchmarks.runner import CheckFailed, Results
 from experiments.benchmarks.table import Goal
 from experiments.benchmarks.worker import Worker, WorkerError
 from srl_jax.errors import ConfigError
+from tests.helpers import SMALL
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 SERVE = """
@@ -286,11 +287,7 @@ def tiny(monkeypatch):
     from srl_jax import loop
     from srl_jax.config import Config
 
-    config = Config(
-        game="Catch", frame_size=42, encoder="tiny:features=8", rl="rainbow:hidden=8,atoms=5", num_envs=4,
-        buffer_size=400, batch_size=8, learn_start=40, updates_per_step=0.25, steps=1000, eval_every=100,
-        eval_games=2,
-    )  # fmt: skip
+    config = Config(**SMALL | {"updates_per_step": 0.25, "steps": 1000, "eval_every": 100})
     monkeypatch.setattr(jax_side, "config_of", lambda preset: config)
     monkeypatch.setattr(loop, "act_and_step", loop.act_and_step)  # the worker's own goes with the test
     return config

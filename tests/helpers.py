@@ -12,6 +12,25 @@ from srl_jax.window import to_unit
 SIZE, STACK, NUM_ACTIONS = 6, 4, 3
 """Of the frames, observations and actions that the helpers make, unless told otherwise."""
 
+SMALL = {
+    "game": "Catch",
+    "frame_size": 42,
+    "encoder": "tiny:features=8",
+    "rl": "rainbow:hidden=16,atoms=11,v_min=-2,v_max=2",
+    "num_envs": 4,
+    "buffer_size": 400,
+    "batch_size": 8,
+    "learn_start": 40,
+    "updates_per_step": 0.125,
+    "steps": 240,
+    "log_every": 40,
+    "eval_every": 120,
+    "eval_games": 3,
+    "slow_update_every": 5,
+}
+JOINT = {"mode": "joint", "objectives": ("reconstruction", "latent_l2")}
+"""Settings of short runs: whole ones share what jax compiles, as far as they can."""
+
 
 def _compiler_options() -> dict:
     options = {"xla_backend_optimization_level": 0}

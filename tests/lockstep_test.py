@@ -1,6 +1,8 @@
 """srl_jax/lockstep.py: several seeds in one process are the runs that they would be alone."""
 
+import itertools
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -9,7 +11,7 @@ from srl_jax import checkpoint, loop
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.lockstep import Together, train_seeds
-from srl_jax.metrics import read_metrics
+from srl_jax.metrics import read_metrics, strip_wall
 
 CONFIG = dict(
     game="Catch", mode="joint", frame_size=42, encoder="tiny:features=8", objectives=("inverse",), num_envs=2,
@@ -58,9 +60,13 @@ def test_an_error_ends_it_for_all():
 
 
 @pytest.fixture(scope="module")
-def runs(tmp_path_factory):
+def path(tmp_path_factory):
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def runs(path):
     """(rows of seeds 7 and 3 together, rows of seed 3 alone)."""
-    path = tmp_path_factory.mktemp("runs")
     for name in ("s7", "s3", "alone"):
         (path / name).mkdir()
     results = train_seeds(Config(**CONFIG), [7, 3], [path / "s7", path / "s3"], progress=False)
@@ -93,6 +99,47 @@ def test_seeds_differ(runs):
     assert not np.allclose(*losses)
 
 
+@pytest.mark.parametrize("stop", [16, 35])
+def test_seeds_that_are_stopped_and_go_on_are_those_that_were_not(runs, path, tmp_path, stop):
+    # Two env steps a step: stopped after 32, before learning starts, and after 70, in an evaluation.
+    outs = [tmp_path / "s7", tmp_path / "s3"]
+    for out in outs:
+        out.mkdir()
+    asked = itertools.count()
+    train = lambda **options: train_seeds(Config(**CONFIG), [7, 3], outs, progress=False, **options)  # noqa: E731
+    results = train(stop=lambda: next(asked) >= 2 * stop)  # both ask once a step
+    assert [(r.interrupted, r.env_steps) for r in results] == [(True, 2 * stop)] * 2
+    manifests = [checkpoint.newest_good(out, pytest.fail) for out in outs]
+    assert [(m.env_steps, m.config.seed) for m in manifests] == [(2 * stop, 7), (2 * stop, 3)]
+    results = train(resume=manifests)
+    assert [(r.interrupted, r.updates) for r in results] == [(False, 20)] * 2
+    for out in outs:
+        again, whole = (read_metrics(folder / out.name / "metrics.jsonl") for folder in (tmp_path, path))
+        assert [strip_wall(row) for row in again] == [strip_wall(row) for row in whole]
+        ours, theirs = (checkpoint.read_manifest(folder / out.name).files for folder in (tmp_path, path))
+        assert ours == theirs  # the same sums: parameters are bit-identical
+
+
+def test_a_seed_keeps_what_it_can_go_on_from_until_all_have_ended(tmp_path, monkeypatch):
+    outs = [tmp_path / "s7", tmp_path / "s3"]
+    for out in outs:
+        out.mkdir()
+    slim, save, there = checkpoint.slim, loop.Run.save_parameters, []
+
+    def late(run, *arguments, **options):
+        time.sleep(0.3 if run.config.seed == 3 else 0)
+        save(run, *arguments, **options)
+
+    def slimming(manifest):
+        there.append([(out / "checkpoints" / "000000120").exists() for out in outs])
+        return slim(manifest)
+
+    monkeypatch.setattr(loop.Run, "save_parameters", late)
+    monkeypatch.setattr(checkpoint, "slim", slimming)
+    train_seeds(Config(**CONFIG), [7, 3], outs, progress=False)
+    assert there == [[True, True]] * 2
+
+
 @pytest.mark.parametrize("error", [ConfigError("had enough"), KeyboardInterrupt()], ids=["error", "ctrl-c"])
 def test_a_seed_that_ends_early_ends_all(tmp_path, monkeypatch, error):
     original = loop.Run.update
@@ -106,12 +153,13 @@ def test_a_seed_that_ends_early_ends_all(tmp_path, monkeypatch, error):
     outs = [tmp_path / "a", tmp_path / "b"]
     for out in outs:
         out.mkdir()
-    config = Config(**{**CONFIG, "mode": "rl_only", "objectives": (), "srl_every": 1})
+    changes = {"mode": "rl_only", "objectives": (), "srl_every": 1, "checkpoint_every": 40}
+    config = Config(**CONFIG | changes)
     run = lambda: train_seeds(config, [0, 1], outs, progress=False)  # noqa: E731
     if isinstance(error, ConfigError):
         with pytest.raises(ConfigError, match="had enough"):
             run()
         return
     assert [result.interrupted for result in run()] == [True, True]
-    manifests = [checkpoint.read_manifest(out) for out in outs]
-    assert [m.updates for m in manifests] == [3, 3]  # saved, all the same
+    manifests = [checkpoint.newest_good(out, pytest.fail) for out in outs]
+    assert [m.env_steps for m in manifests] == [40, 40]  # the last one of both

@@ -1,8 +1,12 @@
 """The loop: schedules, files and reproducibility of whole short runs on Catch."""
 
+import errno
+import itertools
 import json
+import os
 import re
 import shutil
+import threading
 import time
 from types import SimpleNamespace
 
@@ -11,34 +15,25 @@ import pytest
 
 from srl_jax import checkpoint, loop
 from srl_jax.config import Config
-from srl_jax.errors import ConfigError
+from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.update import Hyper
-
-SMALL = {
-    "game": "Catch",
-    "frame_size": 42,
-    "encoder": "tiny:features=8",
-    "rl": "rainbow:hidden=16,atoms=11,v_min=-2,v_max=2",
-    "num_envs": 4,
-    "buffer_size": 400,
-    "batch_size": 8,
-    "learn_start": 40,
-    "updates_per_step": 0.125,
-    "steps": 240,
-    "log_every": 40,
-    "eval_every": 120,
-    "eval_games": 3,
-    "slow_update_every": 5,
-}
-JOINT = {"mode": "joint", "objectives": ("reconstruction", "latent_l2")}
+from tests.helpers import JOINT, SMALL
 
 
-def train(path, **values):
+def train(path, progress=False, stop=None, **values):
+    options = {} if stop is None else {"stop": stop}
     path.mkdir()
     config = Config(**{**SMALL, **values})
     config.save(path)
-    return loop.train(config, path, progress=False)
+    return loop.train(config, path, progress=progress, **options)
+
+
+def whole(path):
+    """The manifest of the newest checkpoint, of which every file is what it says."""
+    manifest = checkpoint.read_manifest(path)
+    checkpoint.verify(manifest)
+    return manifest
 
 
 @pytest.fixture(scope="module")
@@ -233,7 +228,7 @@ def test_an_encoder_that_does_not_fit_is_refused(joint):
             checkpoint.check_sources(config)
 
 
-def test_ctrl_c_saves_and_says_so(tmp_path, monkeypatch):
+def test_ctrl_c_in_the_middle_of_a_step_leaves_the_last_checkpoint(tmp_path, monkeypatch, capsys):
     original = loop.Replay.add
 
     def add(self, *arguments):
@@ -242,11 +237,116 @@ def test_ctrl_c_saves_and_says_so(tmp_path, monkeypatch):
             raise KeyboardInterrupt
 
     monkeypatch.setattr(loop.Replay, "add", add)
-    result = train(tmp_path / "run", **JOINT)
+    path = tmp_path / "run"
+    result = train(path, **JOINT, checkpoint_every=40, progress=True)
     # The step from 96 to 100 was being added; it does not count.
     assert result.interrupted and result.env_steps == 96
-    assert checkpoint.read_manifest(tmp_path / "run").env_steps == 96
+    assert "interrupted after 96 env steps; the last checkpoint is of 80" in capsys.readouterr().err
+    assert whole(path).env_steps == 80 and "run.json" in whole(path).files
     assert "reconstruction" in result.pictures
+
+
+def test_a_run_that_is_told_to_stop_saves_and_says_so(tmp_path, capsys):
+    calls = itertools.count()
+    path = tmp_path / "run"
+    result = train(path, progress=True, stop=lambda: next(calls) == 13)
+    assert result.interrupted and result.env_steps == 13 * 4
+    assert "stopped after 52 env steps; a checkpoint is written" in capsys.readouterr().err
+    assert whole(path).env_steps == 52 and "run.json" in whole(path).files
+
+
+def broken(update, at, name, td_error):
+    """An update whose number `at` gives NaN: in one loss, and in temporal-difference errors or not."""
+    calls = itertools.count(1)
+
+    def call(*arguments):
+        state, errors, metrics = update(*arguments)
+        if next(calls) == at:
+            metrics = metrics | {name: np.float32(np.nan), "loss/total": np.float32(np.nan)}
+            errors = np.full_like(errors, np.nan) if td_error else errors
+        return state, errors, metrics
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("name", "td_error", "env_steps"),
+    # The seventh update is due once (env_steps + 4 - 40) * 0.125 is 7, in the step from 92.
+    [("loss/rl", True, 92), ("loss/reconstruction", False, 120), ("loss/latent_l2", False, 120)],
+)
+def test_a_loss_that_is_nan_ends_the_run_before_another_checkpoint(
+    tmp_path, monkeypatch, name, td_error, env_steps
+):
+    make_agent = loop.make_agent
+
+    def breaking(*arguments):
+        agent = make_agent(*arguments)
+        return agent._replace(update=broken(agent.update, 7, name, td_error))
+
+    monkeypatch.setattr(loop, "make_agent", breaking)
+    path = tmp_path / "run"
+    with pytest.raises(Diverged) as error:
+        train(path, **JOINT, seed=3, checkpoint_every=44)
+    # At once, if the priorities would be set from it, and otherwise when the next row is due.
+    assert f"{name} is not finite after {env_steps} env steps" in str(error.value)
+    assert "\n" not in str(error.value)
+    assert whole(path).env_steps == 88
+    rows = read_metrics(path / "metrics.jsonl")
+    assert [row["env_steps"] for row in rows if row["kind"] == "train"] == [40, 80]
+    assert all(row[x] is not None for row in rows for x in row if x.startswith("loss/"))
+
+
+def test_a_loss_that_is_nan_after_the_last_row_is_noticed_at_the_end(tmp_path, monkeypatch):
+    make_agent = loop.make_agent
+
+    def breaking(*arguments):
+        agent = make_agent(*arguments)
+        return agent._replace(update=broken(agent.update, 7, "loss/rl", False))
+
+    monkeypatch.setattr(loop, "make_agent", breaking)
+    for name, values in (("end", {"steps": 96}), ("save", {"checkpoint_every": 96})):
+        with pytest.raises(Diverged, match="after 96 env steps and 7 updates"):
+            train(tmp_path / name, log_every=1000, **values)
+        assert not (tmp_path / name / "checkpoints").exists()
+
+
+@pytest.mark.parametrize("at", [1, 12, 24])
+def test_a_disk_that_is_full_ends_the_run_and_leaves_the_checkpoint_before(tmp_path, monkeypatch, at):
+    calls, save, fsync = itertools.count(1), checkpoint.save, os.fsync
+
+    def full(descriptor):
+        if next(calls) == at:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        fsync(descriptor)
+
+    def failing(*arguments, env_steps, **options):
+        if env_steps == 80:
+            monkeypatch.setattr(os, "fsync", full)
+        return save(*arguments, env_steps=env_steps, **options)
+
+    monkeypatch.setattr(checkpoint, "save", failing)
+    path = tmp_path / "run"
+    with pytest.raises(SaveError, match="000000080: not written: No space left on device"):
+        train(path, checkpoint_every=40)
+    monkeypatch.setattr(os, "fsync", fsync)
+    assert whole(path).env_steps == 40 and "run.json" in whole(path).files
+    assert [p.name for p in (path / "checkpoints").iterdir()] == ["000000040"]
+
+
+def test_a_row_that_cannot_be_written_ends_the_run_with_its_threads(tmp_path, monkeypatch):
+    write = loop.Report.eval_row
+
+    def full(self, *arguments):
+        self._writer._file.close()
+        self._writer._file = open("/dev/full", "ab")
+        write(self, *arguments)
+
+    monkeypatch.setattr(loop.Report, "eval_row", full)
+    before = threading.active_count()
+    with pytest.raises(SaveError, match="metrics.jsonl: a row was not written: No space left"):
+        train(tmp_path / "run", checkpoint_every=20)
+    assert whole(tmp_path / "run").env_steps == 20
+    assert threading.active_count() <= before
 
 
 def test_early_stop(tmp_path):

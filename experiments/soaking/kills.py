@@ -1,7 +1,7 @@
 """Runs that are killed with SIGKILL, again and again, against the same run left alone.
 
-Half of the kills come after a random time, the others at a random operation of writing a checkpoint: before,
-within and after a file, before and after flushing and renaming. What the resumed run is in the end
+Half of the kills come after a random time, the others at a random point of writing a checkpoint: before,
+within and after a file, before and after flushing, linking, renaming and removing. What the resumed run is in the end
 (parameters, optimizer, replay with priorities, generators, environments, metrics but for wall time) must be
 what the other one is, bit for bit.
 """
@@ -18,6 +18,7 @@ from collections import Counter
 from pathlib import Path
 
 from experiments.soaking import Count, Say
+from experiments.soaking.victim import POINTS
 from srl_jax.metrics import read_metrics, strip_wall
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,13 +51,10 @@ KILLS = 110
 FAULTS = 45
 """Of the kills, those inside a checkpoint being written."""
 
-POINTS = 260
-"""Operations among which a fault is drawn: two or three checkpoints of such a run."""
 
-
-def command(out: Path, flags: tuple[str, ...], fault: int = -1) -> list[str]:
+def command(out: Path, flags: tuple[str, ...], fault: str = "") -> list[str]:
     """A victim's command line; OUT.digest and OUT.digest.fault are what it leaves."""
-    victim = [sys.executable, "-m", "experiments.soaking.victim", f"{out}.digest", str(fault)]
+    victim = [sys.executable, "-m", "experiments.soaking.victim", f"{out}.digest", fault]
     return [*victim, *flags, f"--out={out}", "--resume=auto"]
 
 
@@ -133,7 +131,10 @@ def ended(out: Path) -> dict:
 
 def one_life(out: Path, arm: str, draw: random.Random, seconds: float, environment: dict) -> dict:
     """Starts or resumes a run and kills it, or sees it end."""
-    fault = draw.randrange(POINTS) if draw.random() < 0.5 else -1
+    fault = ""
+    if draw.random() < 0.5:
+        # Points come once or twice a checkpoint, but for files and flushes.
+        fault = f"{draw.choice(POINTS)}#{draw.randrange(3)}"
     delay = draw.uniform(0.0, 0.5 * seconds)
     mark = Path(f"{out}.digest.fault")
     mark.unlink(missing_ok=True)
@@ -146,7 +147,7 @@ def one_life(out: Path, arm: str, draw: random.Random, seconds: float, environme
             stderr=errors,
         )
         line = process.stdout.readline()
-        if fault < 0 and line == b"begun\n":
+        if not fault and line == b"begun\n":
             time.sleep(delay)
             process.send_signal(signal.SIGKILL)
         process.communicate(timeout=600)

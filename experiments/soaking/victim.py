@@ -1,12 +1,12 @@
 """A training run that is meant to be killed: `python -m experiments.soaking.victim DIGEST FAULT FLAGS...`.
 
 It is `experiments.train` with the given flags, and says "begun" on stdout when training begins. When the run
-has ended it writes DIGEST, a JSON object of sums of everything that the run is. FAULT is the number of the
-operation of writing checkpoints at which it kills itself, or -1; its name is left in DIGEST.fault.
+has ended it writes DIGEST, a JSON object of sums of everything that the run is. FAULT is a point of writing
+checkpoints at which it kills itself, "NAME#n" for the n-th time that it comes there, or "": see `POINTS`. It leaves
+the name in DIGEST.fault.
 """
 
 import hashlib
-import itertools
 import json
 import os
 import signal
@@ -45,28 +45,46 @@ def digest(run: Any) -> dict[str, str]:
     }
 
 
+POINTS = (
+    *(
+        f"{when} {call}"
+        for call in ("os.replace", "os.fsync", "os.link", "rmtree")
+        for when in ("before", "after")
+    ),
+    *(
+        f"{when} a file ({kind})"
+        for kind in ("npy", "msgpack", "json")
+        for when in ("before", "within", "after")
+    ),
+    "after a file (sha256)",
+)
+"""Where a process that writes checkpoints may be killed."""
+
+
 class Faults:
-    """Counts the operations of writing checkpoints, and kills the process at one of them.
+    """Kills the process when it comes to a point for the n-th time.
 
     Args:
-        at: the operation's number, from 0.
-        fault: called there with the operation's name; returns nothing, if at all.
+        at: "NAME#n", n from 0.
+        fault: called there with the point's name.
     """
 
-    def __init__(self, at: int, fault: Callable[[str], None]):
-        self._at, self._fault = at, fault
-        self._count = itertools.count()
+    def __init__(self, at: str, fault: Callable[[str], None]):
+        self._name, number = at.split("#")
+        self._left, self._fault = int(number), fault
 
     def point(self, name: str) -> None:
-        """An operation."""
-        if next(self._count) == self._at:
-            self._fault(name)
+        """The process is there."""
+        if name == self._name:
+            if self._left == 0:
+                self._fault(name)
+            self._left -= 1
 
     def install(self) -> None:
         """Puts points around what `srl_jax.checkpoint` calls, in this process, for good."""
         from srl_jax import checkpoint
 
-        for name in ("fsync", "replace", "link", "mkdir"):
+        for name in ("fsync", "replace", "link"):
             setattr(os, name, self._around(f"os.{name}", getattr(os, name)))
         checkpoint.shutil.rmtree = self._around("rmtree", checkpoint.shutil.rmtree)
         checkpoint.write = self._writing(checkpoint.write)
@@ -118,8 +136,8 @@ def main(arguments: list[str]) -> int:
         os.kill(os.getpid(), signal.SIGKILL)
 
     loop.Run = Victim
-    if int(fault) >= 0:
-        Faults(int(fault), die).install()
+    if fault:
+        Faults(fault, die).install()
     return train.train(values)
 
 
