@@ -1,9 +1,9 @@
 """Runs that are killed with SIGKILL, again and again, against the same run left alone.
 
 Half of the kills come after a random time, the others at a random point of writing a checkpoint: before,
-within and after a file, before and after flushing, linking, renaming and removing. What the resumed run is in the end
-(parameters, optimizer, replay with priorities, generators, environments, metrics but for wall time) must be
-what the other one is, bit for bit.
+within and after a file, before and after flushing, linking, renaming and removing. What the resumed run is in
+the end (parameters, optimizer, replay with priorities, generators, environments, metrics but for wall time)
+must be what the other one is, bit for bit.
 """
 
 import json

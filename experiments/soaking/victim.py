@@ -2,8 +2,8 @@
 
 It is `experiments.train` with the given flags, and says "begun" on stdout when training begins. When the run
 has ended it writes DIGEST, a JSON object of sums of everything that the run is. FAULT is a point of writing
-checkpoints at which it kills itself, "NAME#n" for the n-th time that it comes there, or "": see `POINTS`. It leaves
-the name in DIGEST.fault.
+checkpoints at which it kills itself, "NAME#n" for the n-th time that it comes there, or "": see `POINTS`. It
+leaves the name in DIGEST.fault.
 """
 
 import hashlib
@@ -45,17 +45,10 @@ def digest(run: Any) -> dict[str, str]:
     }
 
 
+_CALLS, _KINDS = ("os.replace", "os.fsync", "os.link", "rmtree"), ("npy", "msgpack", "json")
 POINTS = (
-    *(
-        f"{when} {call}"
-        for call in ("os.replace", "os.fsync", "os.link", "rmtree")
-        for when in ("before", "after")
-    ),
-    *(
-        f"{when} a file ({kind})"
-        for kind in ("npy", "msgpack", "json")
-        for when in ("before", "within", "after")
-    ),
+    *(f"{when} {call}" for call in _CALLS for when in ("before", "after")),
+    *(f"{when} a file ({kind})" for kind in _KINDS for when in ("before", "within", "after")),
     "after a file (sha256)",
 )
 """Where a process that writes checkpoints may be killed."""
@@ -119,7 +112,9 @@ def main(arguments: list[str]) -> int:
     train.define_flags(values)
     config_flags.parse(["train", *rest], values)
 
-    from srl_jax import loop
+    from srl_jax import loop, snapshot
+
+    snapshot.CHUNK_BYTES = 1 << 20  # so that there are several in a small buffer
 
     class Victim(loop.Run):
         def run(self) -> bool:
