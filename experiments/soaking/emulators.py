@@ -14,7 +14,7 @@ from gymnasium.wrappers import AtariPreprocessing
 from experiments.soaking import Count, Say
 from experiments.soaking.snapshots import NOOP_MAX, Lines, out_of_snapshots
 from srl_jax import envs
-from srl_jax.actor import Policy, seed_for
+from srl_jax.actor import Policy, random_policy, seed_for
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.envs.atari import COUNTERS
@@ -330,9 +330,11 @@ class Recorded(Run):
     def policy(self) -> Policy:
         """Random actions; looks at what it is shown."""
 
+        act = random_policy(self.num_actions, self.random)
+
         def policy(stacks, step, epsilon):
             self.wrong_stacks += np.count_nonzero(~self.env.right_stacks(stacks))
-            return self.random(stacks, step, epsilon)
+            return act(stacks, step, epsilon)
 
         return policy
 
