@@ -9,8 +9,9 @@ from pathlib import Path
 from experiments import flags as config_flags
 from srl_jax import checkpoint, rundir
 from srl_jax.checkpoint import Manifest
-from srl_jax.config import Config, difference, told_to_xla
+from srl_jax.config import PARTIAL, Config, difference, told_to_xla
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.metrics import read_metrics
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
 
@@ -40,7 +41,7 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
         raise ConfigError("--resume=auto: goes on with the run that --overwrite deletes; give one of them")
     path = config_flags.check_place("out", out)
     try:
-        if not path.is_dir() or not any(path.iterdir()):
+        if _blank(path):
             return path
         if resume:
             if not _is_run(path):
@@ -62,6 +63,17 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
     if Path.cwd().is_relative_to(path.resolve()):
         raise ConfigError(f"--out={out}: --overwrite would delete the working directory")
     return path
+
+
+def _blank(path: Path) -> bool:
+    """Whether nothing lies there, or only what a process left that was killed before it wrote config.json."""
+
+    def left(entry: Path) -> bool:
+        if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
+            return _blank(entry)
+        return entry.name in (rundir.LOCK, PARTIAL)
+
+    return not path.is_dir() or all(left(entry) for entry in path.iterdir())
 
 
 def _is_run(path: Path) -> bool:
@@ -100,7 +112,8 @@ def run_directory(path: Path, config: Config) -> Iterator[None]:
         with rundir.held(path):
             try:
                 for old in path.iterdir():
-                    if old.name != rundir.LOCK:
+                    # The old config.json stays until the new one replaces it: it says that this is a run.
+                    if old.name not in (rundir.LOCK, "config.json"):
                         shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
                 config.save(path)
                 written = True
@@ -132,15 +145,20 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
 
     Raises:
         ConfigError: another process writes there, or the run has another configuration, or its checkpoints
-            are all damaged.
+            are all damaged, or gone though there were some.
     """
-    if not path.is_dir() or not any(path.iterdir()):
+    if _blank(path):
         return None
     rundir.check_free(path)
     if differing := difference(Config.load(path), config):
         raise ConfigError(f"--out={path}: the run there has another configuration: {differing}")
     manifest = checkpoint.newest_good(path, say, at_most)
     if manifest is None:
+        if (reached := _reached(path)) >= _first_checkpoint(config):
+            raise ConfigError(
+                f"--out={path}: the run there got to {reached} env steps, and there is no checkpoint that it "
+                "could go on from; --overwrite would start anew"
+            )
         say(f"{path}: no checkpoint there yet; the run begins again")
         return None
     if differing := difference(manifest.config, config):
@@ -153,13 +171,37 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
 
 
 def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
-    """`to_resume` of runs that go on in step: checkpoints of the same env step, or None for all."""
+    """`to_resume` of runs that go on in step: checkpoints of the same env step, or None for all.
+
+    Raises:
+        ConfigError: one cannot go on, or it would have to begin again and another one got further.
+    """
     at_most = None
     while True:
         found = [to_resume(path, config, at_most) for path, config in runs]
         if None in found:
+            first, config = runs[found.index(None)]
+            for (path, _), manifest in zip(runs, found, strict=True):
+                if manifest and (_blank(first) or manifest.env_steps >= _first_checkpoint(config)):
+                    raise ConfigError(
+                        f"--out={first}: no checkpoint there to go on from, while {path} has one of "
+                        f"{manifest.env_steps} env steps; --overwrite would start all of them anew"
+                    )
             return [None] * len(runs)
         steps = {manifest.env_steps for manifest in found}
         if len(steps) == 1:
             return found
         at_most = min(steps)
+
+
+def _first_checkpoint(config: Config) -> int:
+    """Env steps at which the first checkpoint is on disk for certain."""
+    return (config.checkpoint_every or config.eval_every) + config.num_envs
+
+
+def _reached(path: Path) -> int:
+    """The env steps of a run's last row, or 0."""
+    try:
+        return max((int(row["env_steps"]) for row in read_metrics(path / "metrics.jsonl")), default=0)
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0

@@ -27,6 +27,9 @@ _PACKAGES = (
 _ABOUT = ("versions", "git_revision", "environment")
 """What config.json holds beside the fields of Config."""
 
+PARTIAL = "config.json.partial"
+"""The name under which it is written, so that no process that is killed leaves half of it."""
+
 
 def _value(kind: type, default: Any, help: str, unit: str = "", **limits: Any) -> Any:
     return dataclasses.field(default=default, metadata={"info": Info(kind, help, unit, **limits)})
@@ -230,7 +233,12 @@ class Config:
         """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told."""
         about = {"versions": versions(), "git_revision": git_revision(), "environment": told_to_xla()}
         text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)
-        (Path(run) / "config.json").write_text(text + "\n", encoding="utf-8")
+        partial = Path(run) / PARTIAL
+        with open(partial, "w", encoding="utf-8") as file:
+            file.write(text + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, Path(run) / "config.json")
 
 
 INFOS: dict[str, Info] = {f.name: f.metadata["info"] for f in dataclasses.fields(Config)}

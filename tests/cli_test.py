@@ -3,10 +3,13 @@
 import json
 import os
 import pathlib
+import signal
 import subprocess
 import sys
+import time
 import types
 
+import numpy as np
 import pytest
 from absl import flags
 
@@ -14,8 +17,11 @@ import srl_jax
 from experiments import flags as config_flags
 from experiments import train
 from experiments.presets import PRESETS
+from srl_jax import checkpoint, rundir
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
+from srl_jax.metrics import read_metrics, strip_wall
+from tests.helpers import SMALL
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 JOINT = ["--game=Catch", "--mode=joint", "--objective=reconstruction"]
@@ -27,18 +33,22 @@ class Loop(types.ModuleType):
     def __init__(self):
         super().__init__("srl_jax.loop")
         self.calls = []
+        self.resumed = []
 
-    def train(self, config, out):
+    def train(self, config, out, *, resume=None, stop):
+        assert not stop()
         self.calls.append((config, out))
+        self.resumed.append(resume)
         (pathlib.Path(out) / "metrics.jsonl").touch()
-        return types.SimpleNamespace(env_steps=0, updates=0, pictures={})
+        return types.SimpleNamespace(env_steps=0, updates=0, interrupted=False, pictures={})
 
 
 def test_seeds_get_a_run_directory_each(loop, tmp_path, monkeypatch):
     lockstep = types.ModuleType("srl_jax.lockstep")
 
-    def train_seeds(config, seeds, outs):
-        return [loop.train(config, out) for _, out in zip(seeds, outs, strict=True)]
+    def train_seeds(config, seeds, outs, *, resume, stop):
+        runs = zip(seeds, outs, resume, strict=True)
+        return [loop.train(config, out, resume=manifest, stop=stop) for _, out, manifest in runs]
 
     lockstep.train_seeds = train_seeds
     monkeypatch.setitem(sys.modules, "srl_jax.lockstep", lockstep)
@@ -67,7 +77,7 @@ def _parse(arguments):
 def _train(*arguments):
     """What the entry point does, in this process and with flags of its own."""
     try:
-        train.train(_parse(arguments))
+        return train.train(_parse(arguments))
     except ConfigError as error:
         config_flags.fail(error)
 
@@ -258,7 +268,7 @@ def test_a_run_starts_with_its_config_written(loop, tmp_path):
 
 
 def test_a_config_that_the_loop_refuses_leaves_nothing(capsys, loop, tmp_path, monkeypatch):
-    def refuse(config, out):
+    def refuse(config, out, **_):
         raise ConfigError("--encoder_from=x: another architecture")
 
     monkeypatch.setattr(loop, "train", refuse)
@@ -268,6 +278,172 @@ def test_a_config_that_the_loop_refuses_leaves_nothing(capsys, loop, tmp_path, m
     (tmp_path / "empty").mkdir()
     _refused(capsys, f"--out={tmp_path}/empty")
     assert list((tmp_path / "empty").iterdir()) == []
+
+
+# Going on
+
+
+CATCH = ["--game=Catch", "--encoder=tiny", "--frame_size=42", "--steps=500", "--checkpoint_every=100"]
+
+
+def _checkpoint(out, env_steps, ended=False):
+    """A checkpoint of the run in a directory, as the loop writes it."""
+    params = {"encoder": {"kernel": np.ones(2, np.float32)}, "heads": {}}
+    state = None if ended else checkpoint.State({}, {}, {})
+    counts = {"num_actions": 3, "env_steps": env_steps, "updates": 1}
+    return checkpoint.save(out, params, Config.load(out), state=state, **counts)
+
+
+def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    resume = [*CATCH, f"--out={out}", "--resume=auto"]
+    assert _train(*resume) == 0  # a new directory
+    assert Config.load(out).steps == 500
+    assert _train(*resume) == 0  # killed before its first checkpoint
+    assert "no checkpoint there yet; the run begins again" in capsys.readouterr().err
+    made = _checkpoint(out, 200)
+    (out / "metrics.jsonl").write_text("kept")
+    assert _train(*resume) == 0
+    assert loop.resumed == [None, None, made]
+    assert (out / "metrics.jsonl").read_text() == "kept" and made == checkpoint.read_manifest(out)
+    assert not (out / "lock").exists()
+    # Without the flag, nothing is touched, as before.
+    assert "--resume=auto goes on with the run" in _refused(capsys, *CATCH[1:], f"--out={out}")
+
+
+def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    _train(*CATCH, f"--out={out}")
+    _checkpoint(out, 200)
+    before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*"))
+    resume = [*CATCH[1:], f"--out={out}", "--resume=auto"]
+    assert "--resume=auto: goes on with the run that --overwrite deletes" in _refused(
+        capsys, *resume, "--overwrite"
+    )
+    line = _refused(capsys, *resume, "--seed=7", "--gamma=0.5")
+    assert "another configuration: seed is 0 there and 7 here, gamma is 0.99 there and 0.5 here" in line
+    with rundir.held(out):
+        assert f"process {os.getpid()} on" in _refused(capsys, *resume)
+    assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*")) == before
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "notes.txt").write_text("mine")
+    line = _refused(capsys, *CATCH[1:], f"--out={foreign}", "--resume=auto")
+    assert "not a run directory, so --resume=auto cannot go on from it" in line
+    assert [p.name for p in foreign.iterdir()] == ["notes.txt"]
+    assert len(loop.calls) == 1
+
+
+def test_two_processes_do_not_write_one_run(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    _train(*CATCH, f"--out={out}")
+    for flag in ("--overwrite", "--resume=auto"):
+        with rundir.held(out):
+            line = _refused(capsys, *CATCH[1:], f"--out={out}", flag)
+        assert f"process {os.getpid()} on" in line and "is writing there" in line
+        assert (out / "metrics.jsonl").exists() and Config.load(out).steps == 500
+    assert len(loop.calls) == 1
+
+
+def test_a_run_that_has_ended_says_so(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    _train(*CATCH, f"--out={out}")
+    _checkpoint(out, 500, ended=True)
+    capsys.readouterr()
+    assert _train(*CATCH, f"--out={out}", "--resume=auto") == 0
+    assert capsys.readouterr().out == f"the run in {out} has ended: 500 env steps\n"
+    assert len(loop.calls) == 1
+
+
+def test_seeds_go_on_together(capsys, loop, tmp_path, monkeypatch):
+    lockstep = types.ModuleType("srl_jax.lockstep")
+    asked = []
+
+    def train_seeds(config, seeds, outs, *, resume, stop):
+        asked.append((seeds, [m and m.env_steps for m in resume]))
+        return [loop.train(config, out, resume=m, stop=stop) for out, m in zip(outs, resume, strict=True)]
+
+    lockstep.train_seeds = train_seeds
+    monkeypatch.setitem(sys.modules, "srl_jax.lockstep", lockstep)
+    monkeypatch.setattr(srl_jax, "lockstep", lockstep, raising=False)
+    arguments = [*CATCH, f"--out={tmp_path}/runs", "--resume=auto"]
+    _train(*arguments, "--seeds=4,0")
+    for seed, env_steps in ((4, 100), (0, 100), (4, 200)):
+        _checkpoint(tmp_path / "runs" / f"seed{seed}", env_steps)
+    _train(*arguments, "--seeds=4,0")
+    assert asked == [([4, 0], [None, None]), ([4, 0], [100, 100])]
+    line = _refused(capsys, *arguments[1:], "--seeds=4,0,1")
+    assert "seed1: no checkpoint there" in line
+
+
+def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkeypatch):
+    def stopped(config, out, *, resume, stop):
+        assert not stop()
+        (out / "metrics.jsonl").touch()
+        os.kill(os.getpid(), signal.SIGTERM)
+        assert stop()
+        with pytest.raises(KeyboardInterrupt):  # the second one does not wait
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        return types.SimpleNamespace(env_steps=40, updates=0, interrupted=True, pictures={})
+
+    monkeypatch.setattr(loop, "train", stopped)
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert _train(*CATCH, f"--out={tmp_path}/run") == 128 + signal.SIGTERM
+    assert capsys.readouterr().out.endswith(
+        f"stopped after 40 env steps; --resume=auto goes on from there, in {tmp_path}/run\n"
+    )
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+@pytest.mark.parametrize(("error", "status"), [("ConfigError", 2), ("SaveError", 3), ("Diverged", 4)])
+def test_errors_are_one_line_and_have_a_status_of_their_own(error, status):
+    code = (
+        "from experiments import flags; from srl_jax import errors\n"
+        "def main(argv):\n"
+        f"    raise errors.{error}('two\\n lines')\n"
+        "flags.run(main)"
+    )
+    done = _python("-c", code)
+    assert (done.returncode, done.stdout, done.stderr) == (status, "", "error: two lines\n")
+
+
+RUN = [f"--{name}={value}" for name, value in (SMALL | {"steps": 1200, "eval_every": 400}).items()] + [
+    "--tune_runtime=off"
+]
+
+
+def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
+    from srl_jax import loop
+
+    out, command = tmp_path / "run", [sys.executable, "-m", "experiments.train", *RUN]
+    first = subprocess.Popen(
+        [*command, f"--out={out}"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    metrics = out / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while not (metrics.exists() and b"loss/rl" in metrics.read_bytes()):
+        assert first.poll() is None and time.monotonic() < deadline, first.communicate()
+        time.sleep(0.02)
+    with pytest.raises(ConfigError, match=f"process {first.pid} on"):
+        rundir.check_free(out)
+    first.send_signal(signal.SIGTERM)
+    printed, _ = first.communicate(timeout=60)
+    assert first.returncode == 128 + signal.SIGTERM
+    stopped = checkpoint.read_manifest(out).env_steps
+    assert 80 <= stopped < 1200
+    line = f"stopped after {stopped} env steps; --resume=auto goes on from there, in {out}"
+    assert line in printed.splitlines()
+
+    done = _python("-m", "experiments.train", *RUN, f"--out={out}", "--resume=auto")
+    assert done.returncode == 0, done.stderr
+    assert f"1200 env steps, 145 updates; everything is in {out}" in done.stdout
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    loop.train(Config.load(out), whole, progress=False)
+    rows = [[strip_wall(row) for row in read_metrics(path / "metrics.jsonl")] for path in (out, whole)]
+    assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 1200
+    assert checkpoint.read_manifest(out).files == checkpoint.read_manifest(whole).files
 
 
 def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):

@@ -1,0 +1,257 @@
+"""experiments/directories.py: which directories may be written to, and where a run goes on."""
+
+import contextlib
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from experiments.directories import all_to_resume, check_out, run_directory, to_resume
+from srl_jax import checkpoint, rundir
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError, SaveError
+from tests.rundir_test import contents
+
+CONFIG = Config(game="Catch", frame_size=42, steps=500, checkpoint_every=100, num_envs=4)
+PARAMS = {"encoder": {"kernel": np.ones((2, 2), np.float32)}, "heads": {}}
+GOING_ON = checkpoint.State({}, {"x": np.arange(3)}, {"y": 1})
+
+
+def make(path, config=CONFIG, checkpoints=(), ended=False, reached=None):
+    """A run as a killed process leaves it, or one that has ended."""
+    path.mkdir(parents=True)
+    config.save(path)
+    made = []
+    for env_steps in checkpoints:
+        state = None if ended else GOING_ON
+        counts = {"num_actions": 3, "env_steps": env_steps, "updates": 1}
+        made.append(checkpoint.save(path, PARAMS, config, state=state, **counts))
+    rows = [{"kind": "train", "env_steps": n} for n in ([] if reached is None else [0, reached])]
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return made
+
+
+def everything(path):
+    return {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
+
+
+@pytest.fixture(autouse=True)
+def writes_nothing(tmp_path, monkeypatch):
+    """Asking where a run goes on changes nothing."""
+
+    def checked(ask):
+        def asking(*arguments):
+            before = everything(tmp_path)
+            try:
+                return ask(*arguments)
+            finally:
+                assert everything(tmp_path) == before
+
+        return asking
+
+    for ask in (to_resume, all_to_resume):
+        monkeypatch.setitem(globals(), ask.__name__, checked(ask))
+
+
+def test_there_is_nothing_to_go_on_from(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    for name in ("nowhere", "empty"):
+        assert to_resume(tmp_path / name, CONFIG) is None
+    assert capsys.readouterr().err == ""
+    make(tmp_path / "killed early", reached=103)
+    assert to_resume(tmp_path / "killed early", CONFIG) is None
+    assert capsys.readouterr().err.endswith("no checkpoint there yet; the run begins again\n")
+
+
+def test_a_run_goes_on_from_its_newest_good_checkpoint(tmp_path, capsys):
+    first, second = make(tmp_path / "run", checkpoints=(100, 200))
+    assert to_resume(tmp_path / "run", CONFIG) == second
+    assert to_resume(tmp_path / "run", CONFIG, 199) == first
+    assert capsys.readouterr().err == ""
+    (second.path / "x.npy").write_bytes(b"")
+    assert to_resume(tmp_path / "run", CONFIG) == first
+    line = capsys.readouterr().err
+    assert line.startswith("resume: ") and "x.npy: damaged" in line and line.count("\n") == 1
+    shutil.rmtree(first.path)
+    with pytest.raises(ConfigError, match="x.npy: damaged.*no other checkpoint, and --overwrite would start"):
+        to_resume(tmp_path / "run", CONFIG)
+
+
+def test_another_configuration_is_refused_with_what_differs(tmp_path):
+    make(tmp_path / "run", checkpoints=(100,))
+    other = dataclasses.replace(CONFIG, seed=3, gamma=0.9)
+    with pytest.raises(ConfigError) as error:
+        to_resume(tmp_path / "run", other)
+    assert "another configuration: seed is 0 there and 3 here, gamma is 0.99 there and 0.9 here" in str(
+        error.value
+    )
+    # Also where somebody has changed config.json since.
+    other.save(tmp_path / "run")
+    with pytest.raises(ConfigError, match="000000100: of another configuration: seed is 0 there and 3 here"):
+        to_resume(tmp_path / "run", other)
+
+
+def test_xla_that_is_told_something_else_is_said(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("XLA_FLAGS", "--a")
+    made = make(tmp_path / "run", checkpoints=(100,))
+    monkeypatch.setenv("XLA_FLAGS", "--b")
+    assert to_resume(tmp_path / "run", CONFIG) == made[-1]
+    line = capsys.readouterr().err
+    assert "'XLA_FLAGS': '--a'" in line and "'XLA_FLAGS': '--b'" in line and "roundings differ" in line
+
+
+def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(tmp_path):
+    # Going on means that nothing is lost but what came after the last checkpoint.
+    make(tmp_path / "run", reached=104)
+    with pytest.raises(ConfigError, match="got to 104 env steps, and there is no checkpoint"):
+        to_resume(tmp_path / "run", CONFIG)
+
+
+def test_a_run_that_another_process_writes_is_refused(tmp_path):
+    make(tmp_path / "run", checkpoints=(100,))
+    with rundir.held(tmp_path / "run"), pytest.raises(ConfigError, match="process .* is writing there"):
+        to_resume(tmp_path / "run", CONFIG)
+
+
+# Several seeds
+
+
+def seeds(tmp_path, *checkpoints, **options):
+    """Runs of seeds 0, 1, ... with these checkpoints; None for a directory that was never made."""
+    runs = []
+    for seed, env_steps in enumerate(checkpoints):
+        config = dataclasses.replace(CONFIG, seed=seed)
+        if env_steps is not None:
+            make(tmp_path / f"seed{seed}", config, env_steps, **options)
+        runs.append((tmp_path / f"seed{seed}", config))
+    return runs
+
+
+@pytest.mark.parametrize(
+    ("checkpoints", "env_steps"),
+    [
+        (((100, 200), (100, 200)), 200),
+        (((200, 300), (100, 200)), 200),  # killed while the second one saved
+        (((200,), (100, 200), (200, 300)), 200),
+        (((100,), ()), None),  # killed while the second one saved for the first time
+        (((52,), ()), None),
+        (((), ()), None),
+        ((None, None), None),
+        (((), None), None),  # killed while directories were made
+    ],
+)
+def test_seeds_go_on_from_the_newest_step_that_all_have(tmp_path, checkpoints, env_steps):
+    found = all_to_resume(seeds(tmp_path, *checkpoints))
+    assert [manifest and manifest.env_steps for manifest in found] == [env_steps] * len(checkpoints)
+    for seed, manifest in enumerate(found):
+        assert manifest is None or manifest.config.seed == seed
+
+
+@pytest.mark.parametrize("checkpoints", [((100, 200), None), ((52,), None), ((100, 200), ()), ((104,), ())])
+def test_no_seed_begins_again_for_the_sake_of_another(tmp_path, checkpoints):
+    runs = seeds(tmp_path, *checkpoints)
+    with pytest.raises(
+        ConfigError, match="seed1: no checkpoint there to go on from, while .*seed0 has one of"
+    ):
+        all_to_resume(runs)
+    with pytest.raises(ConfigError, match="seed1: no checkpoint there"):
+        all_to_resume(runs[::-1])
+
+
+def test_seeds_without_a_step_in_common_are_refused(tmp_path):
+    runs = seeds(tmp_path, (300, 400), (200,), reached=300)
+    with pytest.raises(ConfigError, match="seed0: the run there got to 300 env steps, and there is no check"):
+        all_to_resume(runs)
+
+
+def test_seeds_of_which_one_was_killed_at_its_end_go_on_from_before(tmp_path):
+    runs = seeds(tmp_path, (400,), (400,))
+    counts = {"num_actions": 3, "env_steps": 500, "updates": 1}
+    checkpoint.save(runs[0][0], PARAMS, runs[0][1], **counts)
+    assert [manifest.env_steps for manifest in all_to_resume(runs)] == [400, 400]
+    checkpoint.save(runs[1][0], PARAMS, runs[1][1], **counts)
+    found = all_to_resume(runs)
+    assert [manifest.env_steps for manifest in found] == [500, 500]
+    assert all(checkpoint.NUMBERS not in manifest.files for manifest in found)
+
+
+# Directories
+
+
+def leftovers(path, kind):
+    """What a process leaves that is killed as it begins."""
+    path.mkdir(parents=True)
+    if kind == "lock":
+        (path / "lock").write_text('{"pid": 1')
+    elif kind == "half a config":
+        (path / "config.json.partial").write_text('{"game": "Ca')
+    elif kind == "seeds":
+        (path / "seed0").mkdir()
+        (path / "seed1").mkdir()
+        (path / "seed0" / "lock").touch()
+
+
+@pytest.mark.parametrize("kind", ["lock", "half a config", "seeds"])
+@pytest.mark.parametrize("resume", [True, False])
+def test_a_process_that_was_killed_as_it_began_is_in_nobodys_way(tmp_path, kind, resume):
+    path = tmp_path / "run"
+    leftovers(path, kind)
+    assert check_out(str(path), CONFIG, overwrite=False, resume=resume) == path
+    assert to_resume(path, CONFIG) is None
+    with run_directory(path, CONFIG):
+        assert set(contents(path)) == {"config.json", "lock"}
+    assert Config.load(path) == CONFIG
+
+
+@pytest.mark.parametrize("file", ["notes.txt", "seed0", "seed0/notes.txt", "seed1/config.json"])
+def test_a_directory_with_anything_else_is_somebodys(tmp_path, file):
+    path = tmp_path / "run"
+    leftovers(path, "lock")
+    (path / file).parent.mkdir(exist_ok=True)
+    (path / file).write_text("{}")
+    for options in ({"resume": True, "overwrite": False}, {"resume": False, "overwrite": True}):
+        with pytest.raises(ConfigError, match="not a run directory"):
+            check_out(str(path), CONFIG, **options)
+
+
+@pytest.mark.parametrize("number", range(1, 20, 3))
+def test_overwriting_that_is_killed_anywhere_can_be_done_again(tmp_path, monkeypatch, number):
+    path = tmp_path / "run"
+    make(path, checkpoints=(100, 200))
+    new, left = dataclasses.replace(CONFIG, seed=1), [number]
+
+    class Killed(BaseException):
+        pass
+
+    def counted(call):
+        def counted(*arguments, **options):
+            left[0] -= 1
+            if not left[0]:
+                raise Killed
+            return call(*arguments, **options)
+
+        return counted
+
+    with monkeypatch.context() as patch, contextlib.suppress(Killed):
+        for owner, name in ((shutil.os, "unlink"), (shutil.os, "rmdir"), (shutil.os, "replace")):
+            patch.setattr(owner, name, counted(getattr(owner, name)))
+        patch.setattr(shutil.os, "fsync", counted(lambda _: None))
+        with run_directory(path, new):
+            pass
+    assert Config.load(path) in (CONFIG, new)
+    assert check_out(str(path), new, overwrite=True, resume=False) == path
+    assert check_out(str(path), new, overwrite=False, resume=True) == path
+    with run_directory(path, new):
+        assert set(contents(path)) == {"config.json", "lock"}
+
+
+def test_a_config_that_cannot_be_written_is_a_save_error(tmp_path, monkeypatch):
+    def full(_):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.fsync", full)
+    with pytest.raises(SaveError, match=f"--out={tmp_path}/run: No space left on device"):
+        with run_directory(tmp_path / "run", CONFIG):
+            raise AssertionError("a run began")
