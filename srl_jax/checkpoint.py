@@ -454,8 +454,8 @@ def _checked(manifest: Manifest, file: str) -> tuple[Path, bytes]:
     if entry is None:
         raise ConfigError(f"{manifest.path}: no {file} in this checkpoint; only a run's own can be resumed")
     data = _bytes(path, entry.bytes)
-    if hashlib.sha256(data).hexdigest() != entry.sha256:
-        raise ConfigError(f"{path}: damaged: its sha256 is not the manifest's")
+    if len(data) != entry.bytes or hashlib.sha256(data).hexdigest() != entry.sha256:
+        raise ConfigError(f"{path}: damaged: its size or sha256 is not the manifest's")
     return path, data
 
 

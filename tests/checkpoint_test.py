@@ -673,6 +673,15 @@ def test_a_size_that_no_file_has_asks_for_no_memory(copy, bytes):
             load(manifest)
 
 
+@pytest.mark.parametrize("more", [-1, 1, 10**23])
+def test_a_size_that_is_not_the_files_is_refused_whatever_the_sum_says(copy, more):
+    entry = json.loads((copy / "manifest.json").read_text())["files"]["params.msgpack"]
+    change = {**entry, "bytes": entry["bytes"] + more}
+    resign(copy, lambda m: m | {"files": m["files"] | {"params.msgpack": change}})
+    with pytest.raises(ConfigError, match="params.msgpack: damaged"):
+        checkpoint.load(checkpoint.read_manifest(copy))
+
+
 @pytest.mark.parametrize("text", ["NaN", "[Infinity]", "-Infinity", "1e999"])
 def test_numbers_are_finite(copy, text):
     replace(copy, "run.json", f'{{"x": {text}}}'.encode())
