@@ -17,12 +17,12 @@ from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import read_metrics, strip_wall
-from tests.helpers import JOINT, SMALL, identical, jit
+from tests.helpers import SMALL, identical, jit
 from tests.rundir_test import contents
 
 MODES = {
     "rl_only": {},
-    "joint": JOINT | {"srl_every": 2, "game": "CatchDistractor"},
+    "joint": {"mode": "joint", "objectives": ("inverse",), "srl_every": 2, "game": "CatchDistractor"},
     "pretrain": {"mode": "pretrain", "objectives": ("inverse",)},
 }
 EVERY = {"steps": 200, "log_every": 40, "eval_every": 60, "checkpoint_every": 52, "eval_games": 5}
@@ -41,8 +41,8 @@ def make_config(mode, **values):
 def make_run(config, path, **options):
     """A run whose agent is compiled once for all runs of a mode."""
     path.mkdir(exist_ok=True)
-    compiled = dataclasses.replace(config, steps=1, stop_at_return=None, seed=0)
-    return loop.Run(config, path, False, agent_of(compiled), **options)
+    no_matter = {"steps": 1, "stop_at_return": None, "checkpoint_every": 0, "keep_encoder_every": 0}
+    return loop.Run(config, path, False, agent_of(dataclasses.replace(config, **no_matter)), **options)
 
 
 def digests(run):
