@@ -355,7 +355,7 @@ class Run:
             return
         td_error = np.asarray(td_error)
         if not np.isfinite(td_error).all():
-            self.check_losses()
+            self.check_losses("a temporal-difference error")
         self.replay.set_priorities(indices, td_error)
 
     # Reporting
@@ -370,13 +370,16 @@ class Run:
         values = {"epsilon": self.epsilon, "beta": self.beta, "replay/transitions": len(self.replay)}
         self.report.train_row(self.env_steps, self.updates, values)
 
-    def check_losses(self) -> None:
+    def check_losses(self, otherwise: str | None = None) -> None:
         """Whether all losses since the last row were finite.
 
+        Args:
+            otherwise: what else is not finite.
+
         Raises:
-            Diverged: one was not.
+            Diverged: one was not, or there is something else.
         """
-        if (name := self.report.means.broken()) is not None:
+        if (name := self.report.means.broken() or otherwise) is not None:
             raise Diverged(
                 f"{name} is not finite after {self.env_steps} env steps and {self.updates} updates; "
                 "the checkpoints are from before"

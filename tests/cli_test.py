@@ -408,9 +408,8 @@ def test_errors_are_one_line_and_have_a_status_of_their_own(error, status):
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "error: two lines\n")
 
 
-RUN = [f"--{name}={value}" for name, value in (SMALL | {"steps": 1200, "eval_every": 400}).items()] + [
-    "--tune_runtime=off"
-]
+SHORT = SMALL | {"steps": 1200, "eval_every": 400}
+RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=off"]
 
 
 def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 import subprocess
 
 import hypothesis
@@ -10,7 +11,7 @@ from hypothesis import strategies as st
 
 from srl_jax import config as config_module
 from srl_jax import modes
-from srl_jax.config import INFOS, Config, resolve
+from srl_jax.config import INFOS, Config, difference, resolve, told_to_xla
 from srl_jax.errors import ConfigError
 from srl_jax.specs import LIMITS
 
@@ -284,3 +285,36 @@ def test_an_encoder_may_be_needed_beyond_the_mode_or_not_be_asked_for():
         modes.check(joint, needs_encoder=True, hint="make one")
     modes.check(joint, needs_encoder=True, complete=False)
     modes.check(Config(mode="frozen"), complete=False)
+
+
+def test_the_difference_of_two_configurations_names_every_field():
+    for name in INFOS:
+        here = Config()
+        object.__setattr__(here, name, "other")  # past its checks
+        assert difference(Config(), here) == f"{name} is {getattr(Config(), name)} there and other here"
+    assert difference(Config(), Config()) == ""
+    assert difference(Config(), Config(seed=1, steps=7)) == (
+        "seed is 0 there and 1 here, steps is 5000000 there and 7 here"
+    )
+
+
+def test_config_json_is_replaced_as_a_whole(tmp_path, monkeypatch):
+    Config(seed=1).save(tmp_path)
+
+    def killed(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(os, "fsync", killed)
+    with pytest.raises(KeyboardInterrupt):
+        Config(seed=2).save(tmp_path)
+    assert Config.load(tmp_path).seed == 1
+
+
+def test_config_json_has_what_xla_was_told(tmp_path, monkeypatch):
+    for name in ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setenv("XLA_FLAGS", "--a --b")
+    monkeypatch.setenv("NPROC", "2")
+    Config().save(tmp_path)
+    told = json.loads((tmp_path / "config.json").read_text())["environment"]
+    assert told == {"XLA_FLAGS": "--a --b", "NPROC": "2"} == told_to_xla()

@@ -10,18 +10,19 @@ from unittest import mock
 import jax
 import numpy as np
 import pytest
+from flax import serialization
 
 from srl_jax import checkpoint, envs, loop, snapshot
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import read_metrics, strip_wall
-from tests.helpers import JOINT, SMALL, jit
+from tests.helpers import SMALL, identical, jit
 from tests.rundir_test import contents
 
 MODES = {
     "rl_only": {},
-    "joint": JOINT | {"srl_every": 2, "game": "CatchDistractor"},
+    "joint": {"mode": "joint", "objectives": ("inverse",), "srl_every": 2, "game": "CatchDistractor"},
     "pretrain": {"mode": "pretrain", "objectives": ("inverse",)},
 }
 EVERY = {"steps": 200, "log_every": 40, "eval_every": 60, "checkpoint_every": 52, "eval_games": 5}
@@ -40,8 +41,8 @@ def make_config(mode, **values):
 def make_run(config, path, **options):
     """A run whose agent is compiled once for all runs of a mode."""
     path.mkdir(exist_ok=True)
-    compiled = dataclasses.replace(config, steps=1, stop_at_return=None, seed=0)
-    return loop.Run(config, path, False, agent_of(compiled), **options)
+    no_matter = {"steps": 1, "stop_at_return": None, "checkpoint_every": 0, "keep_encoder_every": 0}
+    return loop.Run(config, path, False, agent_of(dataclasses.replace(config, **no_matter)), **options)
 
 
 def digests(run):
@@ -231,7 +232,7 @@ def stopped(tmp_path_factory):
 
 @pytest.fixture
 def put(stopped, tmp_path, monkeypatch):
-    """A function: brings a run to a checkpoint that was changed, and opens its report."""
+    """A function: brings a run to a checkpoint that was changed, and says what it would save then."""
     config, path = stopped
     copy = shutil.copytree(path, tmp_path / "copy")
     run = make_run(config, copy)
@@ -245,7 +246,9 @@ def put(stopped, tmp_path, monkeypatch):
         checkpoint.verify(manifest)
         snapshot.put(run, manifest)
         with run.report:
-            json.dumps(snapshot.take(run).numbers, allow_nan=False)
+            state = snapshot.take(run)
+        json.dumps(state.numbers, allow_nan=False)
+        return state
 
     put.folder = copy / "checkpoints" / "000000072"
     put.run = run
@@ -261,6 +264,24 @@ def replace(folder, file, data, **entry):
     sums = {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()}
     about["files"][file] = about["files"].get(file, {}) | sums | entry
     checkpoint.sign(folder, about)
+
+
+def test_what_is_put_is_what_is_taken(put):
+    numbers = json.loads((put.folder / "run.json").read_text())
+    numbers["score"] = [1.5, -2.0, 0.0, 1 / 3]  # Catch has none before a game is over
+    replace(put.folder, "run.json", json.dumps(numbers).encode())
+    manifest = checkpoint.read_manifest(put.folder)
+    state = put()
+    taken = json.loads(json.dumps(state.numbers))
+    assert taken["report"].pop("seconds") > numbers["report"].pop("seconds")
+    assert taken == numbers
+    assert {f"{name}.npy" for name in state.arrays} == {f for f in manifest.files if f.endswith(".npy")}
+    for name, array in state.arrays.items():
+        written = checkpoint.load_array(manifest, name)
+        assert (array.dtype, array.tobytes()) == (written.dtype, written.tobytes())
+    assert set(state.trees) == {"learner", "evaluation"}
+    for name, tree in state.trees.items():
+        assert identical(serialization.to_state_dict(tree), checkpoint.load_tree(manifest, name))
 
 
 def check_refused_or_possible(put, what):
@@ -296,7 +317,7 @@ def changed(value, path, new):
 
 def test_numbers_that_were_changed_are_refused_or_possible(put):
     numbers = json.loads((put.folder / "run.json").read_text())
-    assert numbers["evaluating"] and put() is None
+    assert numbers["evaluating"] and put()
     refused = tried = 0
     for path in paths(numbers):
         values = (None, "REMOVED", [], {}, "x", -1, 1.5, 10**400)
@@ -333,7 +354,7 @@ def test_arrays_that_were_changed_are_refused_or_possible(put):
                 continue
             assert (other.dtype, other.shape) == (array.dtype, array.shape), file
         replace(put.folder, file, data, dtype=entry.dtype, shape=list(entry.shape))
-    assert put() is None
+    assert put()
 
 
 def test_files_that_are_missing_from_the_manifest_are_named(put):
