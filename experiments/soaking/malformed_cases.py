@@ -199,6 +199,16 @@ def signed(name: str, data: bytes) -> Callable[[Path], None]:
     return change
 
 
+def to_go_on(name: str, data: bytes) -> Callable[[Path], None]:
+    """As `signed`, in a checkpoint that a run would go on from: it has a run.json."""
+
+    def change(folder: Path) -> None:
+        signed("run.json", b"{}")(folder)
+        signed(name, data)(folder)
+
+    return change
+
+
 def sparse(path: Path) -> None:
     """A file of a terabyte that takes no room."""
     with open(path, "wb") as file:
@@ -952,9 +962,14 @@ def _pickles() -> Iterator[Case]:
             yield Case(PICKLES, f"{name} ({kind})", *_evaluate(), name, change)
             yield Case(PICKLES, f"{name} ({kind}), to train", *_train(*START), "{source}", change)
             yield Case(PICKLES, f"{name} ({kind}), to pretrain", *_train(*GIVEN), "{source}", change)
-        for name in ("params.msgpack", "learner.msgpack", "run.json", "replay_frames.npy", "agent.pkl"):
+        for name in ("params.msgpack", "replay_frames.npy", "agent.pkl"):
             change = forged(signed(name, data))
             yield Case(PICKLES, f"{name} ({kind}), signed", *_evaluate(), "{checkpoint}", change)
+        for name in ("params.msgpack", "learner.msgpack", "run.json"):
+            call = _train("--out={source}", "--resume=auto", *FITTING)
+            yield Case(
+                PICKLES, f"{name} ({kind}), signed, to go on", *call, name, forged(to_go_on(name, data))
+            )
         yield Case(PICKLES, f"flagfile ({kind})", *_train("--flagfile=file"), "", put(file=data))
         prepare = put(agent_pkl=data)
         for call, names in (

@@ -1,7 +1,7 @@
 """A training run that is meant to be killed: `python -m experiments.soaking.victim DIGEST FAULT FLAGS...`.
 
 It is `experiments.train` with the given flags, and says "begun" on stdout when training begins. When the run
-has ended it writes DIGEST, a JSON object of sums of everything that the run is. FAULT is a point of writing
+ends it writes DIGEST, a JSON object of sums of everything that the run is. FAULT is a point of writing
 checkpoints at which it kills itself, "NAME#n" for the n-th time that it comes there, or "": see `POINTS`. It
 leaves the name in DIGEST.fault.
 """
@@ -122,9 +122,9 @@ def main(arguments: list[str]) -> int:
             return super().run()
 
         def finish(self) -> None:
-            sums = digest(self)
+            # First: a run that is killed after its last checkpoint has ended, and does not come here again.
+            Path(path).write_text(json.dumps(digest(self)), encoding="utf-8")
             super().finish()
-            Path(path).write_text(json.dumps(sums), encoding="utf-8")
 
     def die(name: str) -> None:
         Path(f"{path}.fault").write_text(name, encoding="utf-8")
