@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterator
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest import mock
 
 import numpy as np
 
@@ -84,7 +85,8 @@ def make_valid_run(run: Path) -> None:
 
     config = resolved(Config(**SETTINGS))
     run.mkdir(parents=True)
-    config.save(run)
+    with mock.patch.dict(os.environ, JAX_PLATFORMS="cpu"):  # as the cases' processes have it
+        config.save(run)
     agent = make_agent(config, NUM_ACTIONS)
     shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
