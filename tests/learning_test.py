@@ -46,12 +46,13 @@ def test_joint(tmp_path):
 @pytest.mark.parametrize("mode", ["frozen", "finetuned", "decoupled"])
 def test_on_the_encoder_of_an_rl_run(rl_only, tmp_path, mode):
     # Half the steps: the new head finds an encoder that knows where the ball is. Decoupled has to keep the
-    # encoder near it, by a small rate: at the preset's, reconstruction, which does not show the ball on
-    # Catch, makes the encoder forget it (-0.60), and from scratch it does not find it.
+    # encoder near it, by a small rate: reconstruction does not show the ball on Catch, and makes the encoder
+    # forget it at the preset's (-0.60) and, over four seeds, at 1e-4 (-0.46 to -0.11); at 3e-5 they end at
+    # -0.12 to 0.32. From scratch it does not find it.
     source, _ = rl_only
     short = {"steps": 12_000, "eval_every": 12_000, "eps_anneal_steps": 4_000}
     if mode == "decoupled":
-        short["lr_srl"] = 1e-4
+        short["lr_srl"] = 3e-5
     _, final = run(tmp_path / mode, f"catch/{mode}", encoder_from=str(source), **short)
     assert final > -0.45
 
