@@ -1,6 +1,6 @@
 """The host loop: act, step, add, sample, update; evaluate, log, checkpoint.
 
-Apart from `checkpoint`, this is the only file that moves data between numpy and the device. The environments
+With `reporting`, `snapshot` and `checkpoint` it moves data between numpy and the device. The environments
 have a thread of their own, which acts and steps while the main thread has the device update. Both work on
 the parameters and the replay of the step before, and meet before the next one; an evaluation has a thread,
 too, and is awaited before the next row is written. So no result depends on timing.
