@@ -1,6 +1,6 @@
 """Tries to break what the project promises about runs that are killed, disks and inputs, and prints a table.
 
-`python -m experiments.soak --out=DIR` runs everything, an hour and a half on two cores; `--only=kills,damage` some
+`python -m experiments.soak --out=DIR` runs everything, 97 minutes on two cores; `--only=kills,damage` some
 of it; `--short` the versions that the test suite runs. Exit status 1 if a promise did not hold.
 """
 
