@@ -50,34 +50,59 @@ _CATCH = {
     "beta_anneal_steps": 70_000,
     "eval_games": 200,
 }
+# While it is being learnt: what is left to learn after these steps says little about an encoder.
+_SHORT = {
+    "steps": 30_000,
+    "eval_every": 3_000,
+    "eval_games": 100,
+    "eps_anneal_steps": 10_000,
+    "beta_anneal_steps": 30_000,
+}
 
-PRESETS: dict[str, dict[str, Any]] = {
+_ARMS: dict[str, dict[str, Any]] = {
     # Figure 6.1, what a pretrained encoder can give, and its encoders.
-    "thesis/rl_only_nature": {**_THESIS, "encoder": "nature", "mode": "rl_only"},
-    "thesis/finetuned_from_rl_nature": {**_THESIS, "encoder": "nature", "mode": "finetuned"},
-    "thesis/finetuned_256_aug": {**_256, **_AUG, "mode": "finetuned"},
-    "thesis/frozen_256": {**_256, "mode": "frozen"},
-    "thesis/pretrain_256": {**_256, **_PRETRAIN},
-    "thesis/pretrain_256_aug": {**_256, **_PRETRAIN, **_AUG},
+    "rl_only_nature": {**_THESIS, "encoder": "nature", "mode": "rl_only"},
+    "finetuned_from_rl_nature": {**_THESIS, "encoder": "nature", "mode": "finetuned"},
+    "finetuned_256_aug": {**_256, **_AUG, "mode": "finetuned"},
+    "frozen_256": {**_256, "mode": "frozen"},
+    "pretrain_256": {**_256, **_PRETRAIN},
+    "pretrain_256_aug": {**_256, **_PRETRAIN, **_AUG},
     # Figure 6.2, the encoder's size under RL alone.
-    "thesis/rl_only_256": {**_256, "mode": "rl_only"},
-    "thesis/rl_only_256_aug": {**_256, **_AUG, "mode": "rl_only"},
+    "rl_only_256": {**_256, "mode": "rl_only"},
+    "rl_only_256_aug": {**_256, **_AUG, "mode": "rl_only"},
     # Figure 6.3, joint training.
-    "thesis/joint_256": {**_256, **_JOINT},
-    "thesis/joint_50": {**_256, **_JOINT, "encoder": "sac_ae:features=50"},
+    "joint_256": {**_256, **_JOINT},
+    "joint_50": {**_256, **_JOINT, "encoder": "sac_ae:features=50"},
     # Figure 6.4, regularisation.
-    "thesis/joint_256_l2_aug": {**_256, **_JOINT, **_AUG},
-    "thesis/joint_256_noreg": {
+    "joint_256_l2_aug": {**_256, **_JOINT, **_AUG},
+    "joint_256_noreg": {
         **_256,
         **_JOINT,
         "objectives": (_RECONSTRUCTION,),
         "decoder_weight_decay": 0.0,
     },
     # Figure 6.5, forward prediction.
-    "thesis/joint_forward_256": {**_256, **_JOINT_FORWARD},
-    "thesis/joint_forward_256_aug": {**_256, **_JOINT_FORWARD, **_AUG},
+    "joint_forward_256": {**_256, **_JOINT_FORWARD},
+    "joint_forward_256_aug": {**_256, **_JOINT_FORWARD, **_AUG},
     # Figure A.1, pretrained and still updated by both losses.
-    "thesis/joint_from_pretrained_256": {**_256, **_JOINT},
+    "joint_from_pretrained_256": {**_256, **_JOINT},
+}
+"""The arms of the thesis' figures by name, and the runs that make their encoders."""
+
+
+def _small(values: dict[str, Any]) -> dict[str, Any]:
+    """An arm at the size of Catch, for a whole figure in an hour: `tiny` stands for both encoders, without a
+    bottleneck for nature, with as many features for the larger one."""
+    name, _, options = values["encoder"].partition(":")
+    own = {**_CATCH, **_SHORT, "encoder": f"tiny:{options}" if name == "sac_ae" else "tiny:features=0"}
+    if values["mode"] == "pretrain":
+        own["steps"] = 3 * own["steps"] // 10  # as 15 epochs to 50
+    return {**values, **own}
+
+
+PRESETS: dict[str, dict[str, Any]] = {
+    **{f"thesis/{name}": values for name, values in _ARMS.items()},
+    **{f"small/{name}": _small(values) for name, values in _ARMS.items()},
     # What `make train` runs: a look at the whole in about three minutes on two cores.
     "demo": {
         **_JOINT,
@@ -97,15 +122,30 @@ PRESETS: dict[str, dict[str, Any]] = {
     "catch/decoupled": {**_CATCH, **_JOINT, "mode": "decoupled"},
 }
 
+_FAMILIES = ("thesis", "small")
+
 ENCODER_PRESETS: dict[str, str] = {
-    "thesis/finetuned_from_rl_nature": "thesis/rl_only_nature",
-    "thesis/finetuned_256_aug": "thesis/pretrain_256_aug",
-    "thesis/frozen_256": "thesis/pretrain_256",
-    "thesis/joint_from_pretrained_256": "thesis/pretrain_256",
+    **{
+        f"{family}/{arm}": f"{family}/{source}"
+        for family in _FAMILIES
+        for arm, source in {
+            "finetuned_from_rl_nature": "rl_only_nature",
+            "finetuned_256_aug": "pretrain_256_aug",
+            "frozen_256": "pretrain_256",
+            "joint_from_pretrained_256": "pretrain_256",
+        }.items()
+    },
     "catch/frozen": "catch/pretrain",
     "catch/finetuned": "catch/pretrain",
 }
 """Presets that need --encoder_from, and the preset whose run makes that encoder."""
+
+POLICY_PRESETS: dict[str, str] = {
+    f"{family}/{arm}": f"{family}/rl_only_nature"
+    for family in _FAMILIES
+    for arm in ("pretrain_256", "pretrain_256_aug")
+}
+"""Presets that the thesis ran on the frames of a trained agent, --policy_from, and the preset of its run."""
 
 _SOLVED = {"Pong": 20.0}
 """Mean evaluation return at which the thesis' runs of a game stop early."""

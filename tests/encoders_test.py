@@ -128,7 +128,17 @@ def test_frames_that_would_be_cut_are_refused_with_the_size_that_fits():
     encoders.sac_ae((84, 84, 4))
 
 
-@pytest.mark.parametrize("name", ["sac_ae", "tiny"])
-def test_a_bottleneck_needs_features(name):
+def test_a_bottleneck_needs_features():
     with pytest.raises(ValueError, match="features"):
-        encoders.REGISTRY[name]((84, 84, 4), features=0)
+        encoders.sac_ae((84, 84, 4), features=0)
+    with pytest.raises(ValueError, match="features"):
+        encoders.tiny((42, 42, 4), features=-1)
+
+
+def test_tiny_without_a_bottleneck_gives_its_maps():
+    # 42 -> (42 - 6) / 4 + 1 = 10 -> (10 - 4) / 2 + 1 = 4: 16 maps of 4 x 4, none below zero.
+    encoder = encoders.tiny((42, 42, 4), features=0)
+    assert encoder.features == 256
+    observation = np.random.default_rng(0).integers(0, 256, (2, 42, 42, 4), np.uint8)
+    z = np.asarray(encoder.apply(encoder.init(jax.random.key(0)), observation))
+    assert z.shape == (2, 256) and z.min() == 0 and z.max() > 0

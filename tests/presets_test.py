@@ -5,7 +5,7 @@ import dataclasses
 import pytest
 
 from experiments import train
-from experiments.presets import ENCODER_PRESETS, PRESETS, preset_values
+from experiments.presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, preset_values
 from srl_jax import modes, specs
 from srl_jax.config import Config
 
@@ -25,8 +25,21 @@ def _config(name, **values):
     return config
 
 
-def test_every_arm_has_a_preset():
-    assert {f"thesis/{arm}" for arm in ARMS} == {n for n in PRESETS if n.startswith("thesis/")}
+@pytest.mark.parametrize("family", ["thesis", "small"])
+def test_every_arm_has_a_preset(family):
+    assert {f"{family}/{arm}" for arm in ARMS} == {n for n in PRESETS if n.startswith(f"{family}/")}
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_a_small_arm_is_the_arm_at_another_size(arm):
+    large, small = _config(f"thesis/{arm}"), _config(f"small/{arm}")
+    for field in ("mode", "objectives", "augment", "decoder_weight_decay", "updates_per_step"):
+        assert getattr(small, field) == getattr(large, field)
+    same = {"nature": 0, "sac_ae:features=50": 50, "sac_ae:features=256": 256}
+    assert small.encoder == f"tiny:features={same[large.encoder]}"
+    # The proportion of 15 to 50 epochs.
+    assert small.steps == (9_000 if small.mode == "pretrain" else 30_000)
+    assert small.game == "Catch" and small.frame_size == 42
 
 
 def test_every_mode_has_a_catch_preset():
@@ -70,10 +83,22 @@ def test_an_arm_is_what_its_name_says(name):
 
 def test_an_encoder_comes_from_a_run_that_fits():
     needs = {name for name, values in PRESETS.items() if values["mode"] in ("frozen", "finetuned")}
-    assert set(ENCODER_PRESETS) == needs | {"thesis/joint_from_pretrained_256"}
+    both = {f"{family}/joint_from_pretrained_256" for family in ("thesis", "small")}
+    assert set(ENCODER_PRESETS) == needs | both
     for name, source in ENCODER_PRESETS.items():
         user, maker = _config(name), _config(source)
         for field in ("encoder", "frame_size", "frame_stack", "game"):
+            assert getattr(user, field) == getattr(maker, field)
+
+
+def test_frames_for_pretraining_come_from_a_run_that_fits():
+    assert set(POLICY_PRESETS) == {
+        f"{family}/{arm}" for family in ("thesis", "small") for arm in ("pretrain_256", "pretrain_256_aug")
+    }
+    for name, source in POLICY_PRESETS.items():
+        user, maker = _config(name), _config(source)
+        assert modes.MODES[maker.mode].rl
+        for field in ("frame_size", "frame_stack", "game"):
             assert getattr(user, field) == getattr(maker, field)
 
 

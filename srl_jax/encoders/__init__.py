@@ -37,10 +37,13 @@ def sac_ae(observation_shape: tuple, *, features: int = 256, layer_norm: bool = 
 def tiny(observation_shape: tuple, *, features: int = 64) -> Encoder:
     """A small encoder for tests and for Catch: two convolutions and a bottleneck.
 
+    Args:
+        features: size of the bottleneck; 0 leaves it out, as `nature` does.
+
     Raises:
         ValueError: where features is out of range or the frames are too small.
     """
-    check_size("features", features)
+    check_size("features", features, least=0)
     layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
     return convolutional_encoder(observation_shape, layers, features=features)
 
