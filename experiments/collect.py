@@ -1,0 +1,146 @@
+"""Runs read from disk, grouped by game and arm, and what may be compared with what.
+
+The layout is ROOT/GAME/ARM/seedN/; a run directory that lies elsewhere is an arm of its own name. Imports no
+jax.
+"""
+
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments.draw import read_rows
+from srl_jax.config import INFOS, Config
+from srl_jax.errors import ConfigError
+
+PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
+"""Fields that say what a score means: runs that differ in one are not compared, unless forced."""
+
+OF_A_SEED = ("seed", "encoder_from", "policy_from")
+"""Fields in which runs of one arm and game may differ."""
+
+
+class RunData(NamedTuple):
+    """One run, finished or not.
+
+    Attributes:
+        path: of the run directory.
+        game, arm, seed: what it is a run of.
+        config: its config.json.
+        rows: of its metrics.jsonl; none if it has not begun.
+    """
+
+    path: Path
+    game: str
+    arm: str
+    seed: int
+    config: Config
+    rows: list[dict]
+
+
+def arm_name(path: Path) -> str:
+    """The arm of a run directory: its parent's name if it is called seedN, else its own without _seedN."""
+    if re.fullmatch(r"seed\d+", path.name):
+        return path.absolute().parent.name
+    return re.sub(r"_seed\d+$", "", path.name)
+
+
+def load_run(path: Path) -> RunData:
+    """Reads a run directory.
+
+    Raises:
+        ConfigError: it is none, or what it holds is not what training writes.
+    """
+    config = Config.load(path)
+    metrics = path / "metrics.jsonl"
+    rows = read_rows(metrics) if metrics.exists() else []
+    return RunData(path, config.game, arm_name(path), config.seed, config, rows)
+
+
+def load_runs(root: str | Path) -> list[RunData]:
+    """All runs in or below a directory, by game, arm and seed. What was moved aside as broken does not count.
+
+    Raises:
+        ConfigError: there is none, one cannot be read, or two are of the same game, arm and seed.
+    """
+    root = Path(root)
+    found = [path.parent for path in [root / "config.json", *sorted(root.rglob("config.json"))]]
+    inside = {path: path.relative_to(root).parts for path in found if path.joinpath("config.json").is_file()}
+    paths = [path for path, parts in inside.items() if not any(".broken-" in part for part in parts)]
+    if not paths:
+        raise ConfigError(f"{root}: no run directory there (none has a config.json)")
+    runs: dict[tuple, RunData] = {}
+    for path in paths:
+        run = load_run(path)
+        other = runs.setdefault((run.game, run.arm, run.seed), run)
+        if other is not run:
+            raise ConfigError(f"{path}: the same game, arm and seed as {other.path}; move one of them away")
+    return [runs[key] for key in sorted(runs)]
+
+
+def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:
+    """{game: {arm: its runs by seed}}, games and arms in the order in which they come."""
+    groups: dict[str, dict[str, list[RunData]]] = {}
+    for run in runs:
+        groups.setdefault(run.game, {}).setdefault(run.arm, []).append(run)
+    return groups
+
+
+def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
+    """The learning curve: env steps int64 [N], ascending, and mean evaluation returns float64 [N]."""
+    rows = [row for row in run.rows if row["kind"] == "eval" and row.get("eval/return_mean") is not None]
+    steps = np.array([row["env_steps"] for row in rows], np.int64)
+    return steps, np.array([row["eval/return_mean"] for row in rows], np.float64)
+
+
+def check_arms(runs: Sequence[RunData]) -> None:
+    """Whether runs of one arm and game differ in nothing but their seed and where its encoder comes from.
+
+    Raises:
+        ConfigError: two differ in more; says in what.
+    """
+    for game, arms in grouped(runs).items():
+        for arm, members in arms.items():
+            for run in members[1:]:
+                if differing := differences(members[0].config, run.config, without=OF_A_SEED):
+                    raise ConfigError(
+                        f"{run.path}: of the same arm, {arm} on {game}, as {members[0].path}, but {differing}"
+                    )
+
+
+def check_protocols(runs: Sequence[RunData], *, force: bool = False) -> list[str]:
+    """Whether returns of these runs mean the same: one protocol for each game.
+
+    Args:
+        runs: those without a policy's returns do not count.
+        force: say what differs, and do not refuse.
+
+    Returns:
+        A line for each run whose protocol is not that of the game's first.
+
+    Raises:
+        ConfigError: there is one, and it is not forced.
+    """
+    found = []
+    first: dict[str, RunData] = {}
+    for run in runs:
+        if not len(steps_and_returns(run)[0]):
+            continue
+        reference = first.setdefault(run.game, run)
+        if differing := differences(reference.config, run.config, only=PROTOCOL):
+            found.append(f"{run.path}: another protocol than {reference.path}: {differing}")
+    if found and not force:
+        raise ConfigError(f"{found[0]}; --force compares them all the same")
+    return found
+
+
+def differences(
+    there: Config, here: Config, *, only: Sequence[str] = tuple(INFOS), without: Sequence[str] = ()
+) -> str:
+    """What differs, `steps is 1000 there and 2000 here, ...`; "" if nothing of these fields does."""
+    names = [name for name in only if name not in without and getattr(there, name) != getattr(here, name)]
+    return ", ".join(
+        f"{name} is {getattr(there, name)} there and {getattr(here, name)} here" for name in names
+    )
