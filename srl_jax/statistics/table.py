@@ -18,7 +18,7 @@ from srl_jax.statistics.bootstrap import Interval, bootstrap, difference
 
 
 def runs_text(scores: Scores) -> str:
-    """How many runs are behind a number: "5 runs", "5 runs of each of 2 games" or "Pong 5 runs, Qbert 3 runs"."""
+    """How many runs: "5 runs", "5 runs of each of 2 games" or "Pong 5 runs, Qbert 3 runs"."""
     numbers = {game: x.shape[-1] for game, x in by_game(scores).items()}
     texts = {game: f"{number} run{'' if number == 1 else 's'}" for game, number in numbers.items()}
     if len(set(numbers.values())) > 1:
