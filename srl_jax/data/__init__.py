@@ -1,4 +1,4 @@
-"""The learning curves of the thesis, to draw beside one's own."""
+"""What others measured, to draw beside one's own: the thesis' curves, scores of humans and of chance."""
 
 import csv
 import functools
@@ -37,14 +37,37 @@ def thesis_curve(figure: str, game: str, arm: str) -> tuple[np.ndarray, np.ndarr
     return np.array(steps, np.int64), np.array(returns, np.float64)
 
 
+def reference_scores(game: str) -> tuple[float, float]:
+    """The raw scores that count as 0 and 1: a random policy's and a human's; a miss and a catch in Catch.
+
+    Args:
+        game: an Atari-57 game, Catch or CatchDistractor.
+
+    Raises:
+        ValueError: the game is none of them.
+    """
+    scores = _reference_scores()
+    if game not in scores:
+        raise ValueError(f"no reference scores for game {game}; there are some for {', '.join(scores)}")
+    return scores[game]
+
+
+@functools.cache
+def _reference_scores() -> dict[str, tuple[float, float]]:
+    return {row["game"]: (float(row["random"]), float(row["human"])) for row in _rows("atari_scores.csv")}
+
+
+def _rows(name: str) -> list[dict[str, str]]:
+    source = importlib.resources.files(__package__) / name
+    with source.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
 @functools.cache
 def _curves() -> dict[tuple[str, str, str], tuple[list[int], list[float]]]:
-    source = importlib.resources.files(__package__) / "thesis_curves.csv"
     curves: dict[tuple[str, str, str], tuple[list[int], list[float]]] = {}
-    with source.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            key = row["figure"], row["game"], row["arm"]
-            steps, returns = curves.setdefault(key, ([], []))
-            steps.append(int(row["env_steps"]))
-            returns.append(float(row["mean_return"]))
+    for row in _rows("thesis_curves.csv"):
+        steps, returns = curves.setdefault((row["figure"], row["game"], row["arm"]), ([], []))
+        steps.append(int(row["env_steps"]))
+        returns.append(float(row["mean_return"]))
     return curves
