@@ -6,7 +6,7 @@ The thesis' six are a table here; a figure of one's own is a small JSON file:
         {"name": "joint_256", "preset": "thesis/joint_256", "thesis": "6.3/joint_256"},
         {"name": "joint_256_sparse", "preset": "thesis/joint_256", "flags": {"srl_every": 4}}]}
 
-`preset` takes any preset, `flags` any flag of experiments.train beside it, a list where a flag may be repeated.
+`preset` takes any preset, `flags` any flag of a run beside it, with a list where it may be repeated.
 """
 
 import re

@@ -111,7 +111,7 @@ def _seeds(panels: Sequence[Panel], label: str) -> str:
 
 
 def _levels(axes, levels: Sequence[Level], end: float) -> None:
-    """Dotted lines with their names above their left ends; those out of sight do not stretch the axis much."""
+    """Dotted lines with their names above their left ends."""
     for level in levels:
         axes.axhline(level.score, color="#888888", linestyle=":", linewidth=1)
         axes.annotate(
