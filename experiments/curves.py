@@ -1,0 +1,120 @@
+"""The picture that compares arms: a panel a game, mean evaluation return against env steps."""
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments import plots
+
+
+class Line(NamedTuple):
+    """One arm on one game.
+
+    Attributes:
+        label: in the legend; the same arm has the same one in all panels.
+        steps: env steps [N].
+        mean: [N] over seeds.
+        low, high: [N], limits of its interval; NaN where there is none.
+        seeds: how many.
+        thesis: (env steps, returns) of the thesis' own curve, or None.
+    """
+
+    label: str
+    steps: Sequence[float]
+    mean: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+    seeds: int
+    thesis: tuple | None = None
+
+
+class Level(NamedTuple):
+    """A published result: a horizontal line that says what it is."""
+
+    label: str
+    score: float
+
+
+class Panel(NamedTuple):
+    """One game."""
+
+    title: str
+    lines: Sequence[Line]
+    levels: Sequence[Level] = ()
+
+
+def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, note: str = "") -> Path:
+    """Draws a panel a game; bands are intervals over seeds.
+
+    The thesis' curves are dashed, in their arm's colour, and end where the panel's longest line does.
+
+    Args:
+        panels: at least one, with at least one line.
+        path: of the PNG file.
+        title: of the figure.
+        note: a line below it.
+    """
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    labels = list(dict.fromkeys(line.label for panel in panels for line in panel.lines))
+    colours = {label: plots.COLOURS[i % len(plots.COLOURS)] for i, label in enumerate(labels)}
+    width = 4.6 if columns > 1 else 6.4
+    figure = plots._figure(width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)
+    handles: dict[str, object] = {}
+    for i, panel in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, i + 1, xlabel=plots.STEPS_LABEL, ylabel="mean return")
+        axes.set_title(panel.title, fontsize=10, parse_math=False)
+        end = max((max(line.steps) for line in panel.lines if len(line.steps)), default=1)
+        for line in panel.lines:
+            if not len(line.steps):
+                continue
+            colour = colours[line.label]
+            axes.fill_between(line.steps, line.low, line.high, color=colour, alpha=0.18, linewidth=0)
+            (handle,) = axes.plot(line.steps, line.mean, color=colour, linewidth=1.8)
+            handles.setdefault(f"{line.label} ({_seeds(panels, line.label)})", handle)
+            if line.thesis is not None:
+                steps, returns = (np.asarray(x, float) for x in line.thesis)
+                at = np.unique(np.minimum(steps, end))
+                (dashed,) = axes.plot(
+                    at, np.interp(at, steps, returns), "--", color=colour, linewidth=1.2, alpha=0.8
+                )
+                handles["the thesis' own, one run each"] = dashed
+        _levels(axes, panel.levels, end)
+        plots._count_axis(axes)
+        axes.set_xlim(0, end)
+    known = "the thesis' own, one run each"
+    if known in handles:  # last, and in no arm's colour
+        from matplotlib.lines import Line2D
+
+        del handles[known]
+        handles[known] = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
+    figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=1 if columns == 1 else 2,
+        fontsize=8,
+    )
+    figure.suptitle(title, fontsize=11).set_parse_math(False)
+    if note:
+        figure.supxlabel(note, fontsize=7.5, color="#555555").set_parse_math(False)
+    return plots._save(figure, path)
+
+
+def _seeds(panels: Sequence[Panel], label: str) -> str:
+    counts = sorted({line.seeds for panel in panels for line in panel.lines if line.label == label})
+    number = " or ".join(map(str, counts))
+    return f"{number} seed{'' if counts == [1] else 's'}"
+
+
+def _levels(axes, levels: Sequence[Level], end: float) -> None:
+    """Dotted lines with their names above their left ends."""
+    for level in levels:
+        axes.axhline(level.score, color="#888888", linestyle=":", linewidth=1)
+        axes.annotate(
+            level.label, (0.01 * end, level.score), xytext=(0, 1.5), textcoords="offset points", fontsize=6,
+            color="#555555", parse_math=False,
+        )  # fmt: skip
