@@ -21,7 +21,7 @@ from srl_jax.specs import LIMITS
 
 FLAGS = flags.FLAGS
 
-GIF_SIZE = 168
+GIF_SIZE = 84
 """Pixels: height and width of play.gif, where frames are smaller by a whole factor."""
 
 
