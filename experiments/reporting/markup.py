@@ -25,7 +25,7 @@ def text(value: Any) -> Markup:
     return Markup(html.escape(str(value)))
 
 
-def tag(name: str, *children: Any, **attributes: Any) -> Markup:
+def tag(name: str, /, *children: Any, **attributes: Any) -> Markup:
     """An element.
 
     Args:
@@ -45,9 +45,7 @@ def tag(name: str, *children: Any, **attributes: Any) -> Markup:
 def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], caption: Any = None) -> Markup:
     """A table in a box that scrolls by itself where it is too wide; a row begins with its heading."""
     top = tag("tr", [tag("th", cell, scope="col") for cell in head])
-    body = [
-        tag("tr", tag("th", row[0], scope="row"), [tag("td", cell) for cell in row[1:]]) for row in rows
-    ]
+    body = [tag("tr", tag("th", row[0], scope="row"), [tag("td", cell) for cell in row[1:]]) for row in rows]
     parts = [tag("caption", caption) if caption else None, tag("thead", top), tag("tbody", body)]
     return tag("div", tag("table", parts), class_="scroll", tabindex="0", role="region")
 
@@ -57,7 +55,9 @@ def details(summary: Any, *children: Any) -> Markup:
     return tag("details", tag("summary", summary), *children)
 
 
-def figure(source: str, caption: Any, alt: str, size: tuple[int, int] | None = None, kind: str = "") -> Markup:
+def figure(
+    source: str, caption: Any, alt: str, size: tuple[int, int] | None = None, kind: str = ""
+) -> Markup:
     """A picture with its caption.
 
     Args:
@@ -86,11 +86,11 @@ def number(value: float | None, digits: int = 2) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """"1 run", "2 runs"."""
+    """ "1 run", "2 runs"."""
     return f"{count:,} {noun}{'' if count == 1 else 's'}"
 
 
 def listed(items: Iterable[Any]) -> str:
-    """"a", "a and b", "a, b and c"."""
+    """ "a", "a and b", "a, b and c"."""
     *first, last = [str(item) for item in items] or ["none"]
     return f"{', '.join(first)} and {last}" if first else last

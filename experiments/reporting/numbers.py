@@ -107,7 +107,9 @@ def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None 
     playing = {run.arm for run in runs if has_policy(run)}
     if given is not None:
         if given not in playing:
-            raise ConfigError(f"--baseline={given}: not an arm with a policy; valid: {', '.join(sorted(playing))}")
+            raise ConfigError(
+                f"--baseline={given}: not an arm with a policy; valid: {', '.join(sorted(playing))}"
+            )
         return given
     plain = {run.arm for run in runs if run.config.mode == "rl_only"}
     return next((arm for arm in arms if arm in plain), next((arm for arm in arms if arm in playing), None))
@@ -148,7 +150,9 @@ def finished(run: RunData) -> bool:
     steps, returns = collect.steps_and_returns(run)
     if config.stop_at_return is not None and (returns >= config.stop_at_return).any():
         return True
-    evaluated = not has_policy(run) or (len(steps) > 0 and steps[-1] >= _last(config.steps, config.eval_every))
+    evaluated = not has_policy(run) or (
+        len(steps) > 0 and steps[-1] >= _last(config.steps, config.eval_every)
+    )
     return evaluated and reached_step(run) >= _last(config.steps, min(config.log_every, config.steps))
 
 
@@ -164,7 +168,9 @@ def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Compariso
     """
     found: dict[str, Comparison | None] = {}
     for game, by_arm in collect.grouped(runs).items():
-        members = [run for arm in arms for run in by_arm.get(arm, []) if len(collect.steps_and_returns(run)[0])]
+        members = [
+            run for arm in arms for run in by_arm.get(arm, []) if len(collect.steps_and_returns(run)[0])
+        ]
         if not members:
             continue
         curves = [collect.steps_and_returns(run) for run in members]
@@ -213,7 +219,10 @@ def targets(
 
 
 def rows(
-    comparisons: Mapping[str, Comparison | None], arms: Sequence[str], baseline: str, wanted: Mapping[str, float]
+    comparisons: Mapping[str, Comparison | None],
+    arms: Sequence[str],
+    baseline: str,
+    wanted: Mapping[str, float],
 ) -> list[Row]:
     """The table of each game, arms in their order."""
     final, area = (scores(comparisons, of, arms) for of in ("final", "area"))
