@@ -1,7 +1,7 @@
 """One self-contained page about many runs: `python -m experiments.report runs/ --out=report.html`.
 
-What was run, figures, statistics with intervals, learning curves, what the agents do and see, diagnostics, cost,
-and every difference between the arms. It opens offline.
+What was run, figures, statistics with intervals, learning curves, what the agents do and see, diagnostics,
+cost, and every difference between the arms. It opens offline.
 """
 
 import os

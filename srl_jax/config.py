@@ -231,8 +231,9 @@ class Config:
             raise ConfigError(f"{path}: {error}") from None
 
     def save(self, run: str | Path) -> None:
-        """Writes a run's config.json: the fields, package versions, git revision, what XLA was told, when the run
-        began (UTC), and how many CPUs the machine has."""
+        """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told; also
+        when the run began (UTC), and how many CPUs the machine has.
+        """
         about = {"versions": versions(), "git_revision": git_revision(), "environment": told_to_xla()}
         about |= {"started": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()), "cpus": os.cpu_count()}
         text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)

@@ -1,4 +1,4 @@
-"""A page in headless Chromium: `python -m experiments.reporting.browser --page=report.html --out=screenshots/`.
+"""A page in headless Chromium: `python -m experiments.reporting.browser --page=report.html --out=shots/`.
 
 Renders it at the width of a desktop and of a phone, writes a screenshot of each, and ends with status 2 where
 the page is wider than its window, logs an error or asks for anything from outside. Needs chromium and
@@ -59,7 +59,8 @@ _DIRECT = urllib.request.build_opener(urllib.request.ProxyHandler({}))
 _MEASURE = """
 const width = window.innerWidth, wider = [];
 for (const e of document.querySelectorAll('body *')) {
-  if (e.getBoundingClientRect().right > width + 1 && !e.closest('.scroll')) wider.push(e.outerHTML.slice(0, 120));
+  const right = e.getBoundingClientRect().right;
+  if (right > width + 1 && !e.closest('.scroll')) wider.push(e.outerHTML.slice(0, 120));
 }
 const images = [...document.images];
 return {width, content: document.scrollingElement.scrollWidth, height: document.scrollingElement.scrollHeight,
@@ -127,7 +128,10 @@ def _session() -> Iterator[Any]:
             stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True,
         )  # fmt: skip
         try:
-            port = next((line.split()[-1].rstrip(".") for line in driver.stdout if "successfully on port" in line), None)
+            port = next(
+                (line.split()[-1].rstrip(".") for line in driver.stdout if "successfully on port" in line),
+                None,
+            )
             if port is None:
                 raise ConfigError("chromedriver did not start")
             options = {"args": [*SWITCHES, f"--user-data-dir={profile}"], "binary": _chromium()}

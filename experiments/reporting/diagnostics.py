@@ -36,7 +36,7 @@ FORMS = (
     Form("diag/effective_rank", "effective rank", meaning="how many directions the latent uses"),
     Form("diag/dormant_share", "dormant units", meaning="share of the latent's units that hardly ever act"),
     Form("diag/constant_share", "constant units", meaning="share of units that are the same for all inputs"),
-    Form("diag/drift/cosine", "cosine to the oldest latents", 0, "the same observations, encoded now and then"),
+    Form("diag/drift/cosine", "cosine to the oldest latents", 0, "the same inputs, encoded then and now"),
     Form("diag/drift/cosine", "cosine to the last latents", -1, "likewise, the newest encoder kept"),
     Form("diag/drift/cka", "CKA with the oldest latents", 0, "likewise, by centred kernel alignment"),
     Form("diag/drift/cka", "CKA with the last latents", -1),
@@ -53,7 +53,7 @@ FORMS = (
     Form("diag/gradient/*/norm_ratio", "{}: gradient norm over RL's"),
     Form("diag/error/*/moving", "{}: error on moving pixels", meaning="does it lose the ball?"),
     Form("diag/error/*/static", "{}: error on static pixels"),
-    Form("diag/error/*/moving_explained", "{}: explained, moving pixels", meaning="1: all, 0: as the mean image"),
+    Form("diag/error/*/moving_explained", "{}: explained, moving pixels", meaning="0: as the mean image"),
     Form("diag/moving_share", "share of pixels that move"),
     Form("diag/probe/mean", "linear probe, mean R²", meaning="the true state from the latent, linearly"),
     Form("diag/probe/*", "linear probe, {}: R²"),
@@ -93,7 +93,7 @@ def panels(runs: Sequence[RunData], arms: Sequence[str]) -> list[Panel]:
                     lines[place] = curve
             if lines:
                 title = form.title.format(_middle(key, form.key))
-                found.append(Panel(title, form.meaning, pictures.small_curves(title, lines)))
+                found.append(Panel(title, form.meaning, pictures.curves(title, lines)))
     return found
 
 

@@ -10,7 +10,7 @@ class Markup(str):
     """Text that is HTML already; every other string is escaped where it becomes part of some."""
 
 
-VOID = ("img", "meta", "link", "br")
+VOID = ("img", "meta", "link", "wbr")
 """Elements without an end."""
 
 
@@ -42,12 +42,29 @@ def tag(name: str, /, *children: Any, **attributes: Any) -> Markup:
     return Markup(f"<{name}{given}>{end}")
 
 
-def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], caption: Any = None) -> Markup:
-    """A table in a box that scrolls by itself where it is too wide; a row begins with its heading."""
-    top = tag("tr", [tag("th", cell, scope="col") for cell in head])
-    body = [tag("tr", tag("th", row[0], scope="row"), [tag("td", cell) for cell in row[1:]]) for row in rows]
-    parts = [tag("caption", caption) if caption else None, tag("thead", top), tag("tbody", body)]
-    return tag("div", tag("table", parts), class_="scroll", tabindex="0", role="region")
+def breakable(name: Any) -> Markup:
+    """A name that a narrow column may break behind its underscores and slashes."""
+    if type(name) is not str:
+        return text(name)
+    return Markup(text(name).replace("_", "_<wbr>").replace("/", "/<wbr>"))
+
+
+def table(head: Sequence[Any], rows: Iterable[Sequence[Any]], label: str, kind: str = "") -> Markup:
+    """A table in a box that scrolls by itself where it is too wide; a row begins with its heading.
+
+    Args:
+        head: the columns' headings.
+        rows: their cells.
+        label: what it is a table of, for readers who do not see it.
+        kind: a class for its style.
+    """
+    top = tag("tr", [tag("th", breakable(cell), scope="col") for cell in head])
+    body = [
+        tag("tr", tag("th", breakable(row[0]), scope="row"), [tag("td", cell) for cell in row[1:]])
+        for row in rows
+    ]
+    inner = tag("table", tag("thead", top), tag("tbody", body), class_=kind or None)
+    return tag("div", inner, class_="scroll", tabindex="0", role="region", aria_label=label)
 
 
 def details(summary: Any, *children: Any) -> Markup:
@@ -55,21 +72,18 @@ def details(summary: Any, *children: Any) -> Markup:
     return tag("details", tag("summary", summary), *children)
 
 
-def figure(
-    source: str, caption: Any, alt: str, size: tuple[int, int] | None = None, kind: str = ""
-) -> Markup:
+def figure(source: str, caption: Any, alt: str, size: tuple[int, int] | None = None) -> Markup:
     """A picture with its caption.
 
     Args:
         source: a data URI.
         caption: below it.
         alt: what a reader who does not see it is told.
-        size: width and height in pixels.
-        kind: a class for its style.
+        size: width and height in pixels; None leaves them to the style.
     """
     width, height = size or (None, None)
     image = tag("img", src=source, alt=alt, width=width, height=height)
-    return tag("figure", image, tag("figcaption", caption), class_=kind or None)
+    return tag("figure", image, tag("figcaption", caption))
 
 
 def number(value: float | None, digits: int = 2) -> str:
@@ -78,11 +92,19 @@ def number(value: float | None, digits: int = 2) -> str:
         return "–"
     if math.isinf(value):
         return "∞" if value > 0 else "−∞"
-    places = 0 if abs(value) >= 1_000 else 1 if abs(value) >= 100 else digits
+    places = 0 if abs(value) >= 1_000 else min(digits, 1) if abs(value) >= 100 else digits
     shown = f"{value:,.{places}f}"
     if float(shown.replace(",", "")) == 0:
         shown = shown.lstrip("-")  # no minus before 0.00
     return shown.replace("-", "−")
+
+
+def duration(hours: float) -> str:
+    """Hours, minutes or seconds, whichever is easy to read."""
+    unit, value = next(
+        ((u, hours * n) for u, n in (("h", 1), ("min", 60)) if hours * n >= 1), ("s", hours * 3600)
+    )
+    return f"{number(value, 0 if unit == 's' else 1)} {unit}"
 
 
 def plural(count: int, noun: str) -> str:

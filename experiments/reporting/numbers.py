@@ -1,9 +1,8 @@
-"""What a report says in numbers: which runs there are, how they compare, what they cost, how they differ.
+"""What a report says in numbers: which runs there are, how they compare, what they cost.
 
 Imports no jax.
 """
 
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,24 +12,14 @@ import numpy as np
 from experiments import collect
 from experiments.collect import RunData
 from experiments.presets import PRESETS
+from experiments.reporting import configs
 from srl_jax import statistics
-from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import LIMITS
 
 NEVER = 1e18
 """Env steps that stand for never, where a median is drawn again."""
-
-
-class About(NamedTuple):
-    """What config.json says of where a run was made; empty where it does not."""
-
-    revision: str
-    started: str
-    cpus: str
-    versions: tuple[tuple[str, str], ...]
 
 
 class Comparison(NamedTuple):
@@ -98,8 +87,9 @@ def arms_of(runs: Sequence[RunData]) -> list[str]:
 
 
 def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None = None) -> str | None:
-    """The arm that others are compared with: the one that was asked for, else the first that is RL alone, else the
-    first with a policy; None where there is none.
+    """The arm that others are compared with, or None where no arm has a policy.
+
+    The one that was asked for, else the first that is RL alone, else the first with a policy.
 
     Raises:
         ConfigError: the one that was asked for is not there.
@@ -118,25 +108,6 @@ def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None 
 def has_policy(run: RunData) -> bool:
     """Whether its mode trains a policy, which is then evaluated."""
     return MODES[run.config.mode].rl
-
-
-def about(run: RunData) -> About:
-    """Reads the rest of a run's config.json.
-
-    Raises:
-        ConfigError: it is not what training writes.
-    """
-    path = run.path / "config.json"
-    try:
-        values = parse_json(read_bytes(path, SETTINGS))
-        versions = values.get("versions") or {}
-        pairs = tuple((str(name), str(version)) for name, version in versions.items())
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except (ValueError, AttributeError) as error:
-        raise ConfigError(f"{path}: {error}") from None
-    revision, started, cpus = (str(values.get(name) or "") for name in ("git_revision", "started", "cpus"))
-    return About(revision, started, cpus, pairs)
 
 
 def reached_step(run: RunData) -> int:
@@ -208,7 +179,7 @@ def scores(comparisons: Mapping[str, Comparison | None], of: str, arms: Sequence
 
 
 def targets(
-    comparisons: Mapping[str, Comparison | None], baseline: str, given: Mapping[str, float]
+    comparisons: Mapping[str, Comparison | None], baseline: str | None, given: Mapping[str, float]
 ) -> dict[str, float]:
     """game -> the score to be reached: the one given, else what the baseline ends with on average."""
     return {
@@ -221,7 +192,7 @@ def targets(
 def rows(
     comparisons: Mapping[str, Comparison | None],
     arms: Sequence[str],
-    baseline: str,
+    baseline: str | None,
     wanted: Mapping[str, float],
 ) -> list[Row]:
     """The table of each game, arms in their order."""
@@ -291,12 +262,7 @@ def _source(run: RunData, runs: Sequence[RunData]) -> str:
         tail = other.path.absolute().parts[-3:]
         if any(parts[i : i + 3] == tail for i in range(len(parts))):
             return other.arm
-    return _source_name(path)
-
-
-def _source_name(path: str) -> str:
-    """The arm that the path of a run or of a checkpoint in it is of."""
-    return collect.arm_name(Path(re.sub(r"/(checkpoints|encoders)(/.*)?$", "", path)))
+    return configs.source_name(path)
 
 
 def value_of(run: RunData, row: Mapping[str, Any], key: str) -> float | None:
@@ -322,61 +288,3 @@ def numbers_of(run: RunData, row: Mapping[str, Any], key: str) -> list[float | N
     value = row.get(key)
     items = value if isinstance(value, list) else [value]
     return [value_of(run, {key: item}, key) for item in items]
-
-
-def settings(runs: Sequence[RunData], arms: Sequence[str]) -> tuple[list[tuple], list[tuple]]:
-    """Every field of the configurations, apart from game and seed.
-
-    Returns:
-        (field, its value in each arm) where two arms differ, and (field, value) of what all share. A value
-        that differs within an arm is said game by game.
-    """
-    differing, shared = [], []
-    for field in INFOS:
-        if field in ("game", "seed"):
-            continue
-        cells = [_setting([run for run in runs if run.arm == arm], field) for arm in arms]
-        if len(set(cells)) > 1:
-            differing.append((field, cells))
-        else:
-            shared.append((field, cells[0]))
-    return differing, shared
-
-
-def _setting(runs: Sequence[RunData], field: str) -> str:
-    by_game: dict[str, list[str]] = {}
-    for run in runs:
-        value = getattr(run.config, field)
-        if value and field in collect.OF_A_SEED:
-            value = _source_name(value)
-        shown = value_text(value)
-        if shown not in by_game.setdefault(run.game, []):
-            by_game[run.game].append(shown)
-    texts = {game: ", ".join(values) for game, values in by_game.items()}
-    if len(set(texts.values())) == 1:
-        return next(iter(texts.values()))
-    return "; ".join(f"{game}: {shown}" for game, shown in texts.items())
-
-
-def value_text(value: Any) -> str:
-    """A setting as a reader would write it."""
-    if value is None:
-        return "off"
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if isinstance(value, tuple):
-        return " + ".join(value) or "none"
-    if isinstance(value, int):
-        return f"{value:,}"
-    return f"{value:g}" if isinstance(value, float) else value or "none"
-
-
-def protocol_text(config: Config) -> str:
-    """How a policy was evaluated, in a line."""
-    sticky = f"sticky actions {config.sticky_actions:g}" if config.sticky_actions else "no sticky actions"
-    return (
-        f"{config.eval_games} full games an evaluation, every {config.eval_every:,} env steps; epsilon "
-        f"{config.eps_eval:g}; {sticky}; up to {config.noop_max} no-ops at the start; at most "
-        f"{config.eval_max_steps:,} env steps a game; in training, a lost life "
-        f"{'ends the return' if config.life_loss else 'ends nothing'}"
-    )

@@ -1,4 +1,4 @@
-"""The pictures of a report, as data URIs: drawn here, or taken from the runs and made smaller where need be."""
+"""Pictures as data URIs: drawn here, or taken from the runs and made smaller where need be."""
 
 import base64
 import io
@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import curves, plots
+from experiments import plots
 from srl_jax import statistics
 from srl_jax.errors import ConfigError
 from srl_jax.reading import read_bytes
@@ -151,14 +151,8 @@ def _as_jpeg(image, size: tuple[int, int]) -> Picture:
     return Picture(f"data:image/jpeg;base64,{base64.b64encode(data).decode()}", size, len(data))
 
 
-def learning_curves(game: str, lines: Sequence[curves.Line], levels: Sequence[curves.Level] = ()) -> Picture:
-    """One game's learning curves."""
-    panel = curves.Panel(game, lines, levels)
-    return drawn(lambda path: curves.comparison([panel], path, ""))
-
-
 def interval_curves(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
-    """The mean of several runs' curves and its interval, at steps that all of them have; None without such."""
+    """The mean of several runs' curves and its interval, at steps that all have; None without such."""
     kept = [(steps, values) for steps, values in runs if len(steps)]
     if not kept:
         return None
@@ -169,29 +163,47 @@ def interval_curves(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | No
     return Curve(steps, *statistics.curve_interval(values))
 
 
-def small_curves(title: str, lines: Mapping[int, Curve]) -> Picture:
-    """A small picture of one number against env steps.
+def curves(
+    title: str,
+    lines: Mapping[int, Curve],
+    *,
+    size: tuple[float, float] = (3.4, 2.3),
+    label: str = "",
+    levels: Sequence[tuple[str, float]] = (),
+) -> Picture:
+    """A picture of one number against env steps; which line is whose is said beside it.
 
     Args:
         title: above it.
         lines: the arm's place, which gives its style -> its curve.
+        size: width and height in inches.
+        label: of the vertical axis.
+        levels: names and heights of dotted lines across.
     """
+    small = size[0] < 4
 
     def draw(path: Path) -> None:
-        figure = plots._figure(3.4, 2.3)
+        figure = plots._figure(*size)
         axes = figure.add_subplot()
         for place, curve in lines.items():
             colour, line = style(place)
             if np.isfinite(curve.low).any():
                 axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
-            marker = "o" if len(curve.steps) == 1 else ""
+            width, marker = 1.5 if small else 1.8, "o" if len(curve.steps) == 1 else ""
             axes.plot(
-                curve.steps, curve.point, line, color=colour, linewidth=1.5, marker=marker, markersize=3
+                curve.steps, curve.point, line, color=colour, linewidth=width, marker=marker, markersize=3
             )
-        axes.set_title(title, fontsize=9, parse_math=False)
+        for name, height in levels:
+            axes.axhline(height, color="#888888", linestyle=":", linewidth=1)
+            axes.annotate(
+                name, (0.01, height), xycoords=axes.get_yaxis_transform(), xytext=(0, 1.5),
+                textcoords="offset points", fontsize=7, color="#555555", parse_math=False,
+            )  # fmt: skip
+        axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
         plots._count_axis(axes)
-        axes.tick_params(labelsize=7)
-        axes.set_xlabel(plots.STEPS_LABEL, fontsize=7.5)
+        axes.tick_params(labelsize=7 if small else 9)
+        axes.set_xlabel(plots.STEPS_LABEL, fontsize=7.5 if small else 9)
+        axes.set_ylabel(label, fontsize=9)
         plots._save(figure, path)
 
     return drawn(draw)
