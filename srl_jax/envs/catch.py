@@ -40,8 +40,10 @@ MAX_DRIFT = 3
 BRIGHTNESS = 252
 """Of ball and paddle. A multiple of 4, so that a quarter of a pixel is exact too."""
 
-LAYER_BRIGHTNESS = 100
-"""The background is a sum of two layers in [0, LAYER_BRIGHTNESS], darker than ball and paddle."""
+LAYER_BRIGHTNESS = 50
+"""The background is a sum of two layers in [0, LAYER_BRIGHTNESS], darker than ball and paddle. It still has
+several times the ball's part in the squared error of an image. Twice as bright, the ball, a pixel and a half
+wide in a frame of 42, is lost in it: Rainbow with `tiny` then learnt nothing in 80,000 env steps."""
 TORUS = 2 * GRID
 """Period of the background's textures in pixels of the grid."""
 MAX_SCROLL = 3
