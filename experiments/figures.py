@@ -150,9 +150,7 @@ def published_levels(game: str, methods: Sequence[str], config: Config, until: i
         found = [entry for entry in published(game) if entry.method == method]
         if found:
             entry = min(found, key=lambda entry: abs((entry.env_steps or 0) - until))
-            differs = entry.differs_from(config, until)
-            label = f"{method}: {entry.score:g}" + (f" ({differs})" if differs else "")
-            levels.append(curves.Level(label, entry.score))
+            levels.append(curves.Level(method, entry.score, entry.differs_from(config, until)))
     return levels
 
 
