@@ -1,4 +1,4 @@
-"""The learning curves of the thesis, to draw beside one's own."""
+"""The learning curves of the thesis, to draw beside one's own; where Atari games keep positions in memory."""
 
 import csv
 import functools
@@ -35,6 +35,17 @@ def thesis_curve(figure: str, game: str, arm: str) -> tuple[np.ndarray, np.ndarr
             f"{', '.join(sorted({g for _, g, _ in curves}))}"
         ) from None
     return np.array(steps, np.int64), np.array(returns, np.float64)
+
+
+def ram_labels(game: str) -> dict[str, int]:
+    """Which bytes of an Atari game's memory hold positions, after AtariARI (Anand et al. 2019).
+
+    Returns:
+        {variable: byte}; empty for a game that nobody has labelled.
+    """
+    source = importlib.resources.files(__package__) / "ram_labels.csv"
+    with source.open(encoding="utf-8", newline="") as file:
+        return {row["variable"]: int(row["byte"]) for row in csv.DictReader(file) if row["game"] == game}
 
 
 @functools.cache
