@@ -31,6 +31,7 @@ SMALL = {
     "eval_every": 120,
     "eval_games": 3,
     "slow_update_every": 5,
+    "diagnostics": False,
 }
 JOINT = {"mode": "joint", "objectives": ("reconstruction", "latent_l2")}
 """Settings of short runs: whole ones share what jax compiles, as far as they can."""

@@ -1,4 +1,4 @@
-"""What others measured, to draw beside one's own: the thesis' curves, scores of humans and of chance."""
+"""What others measured, to draw beside one's own, and where Atari games keep positions in memory."""
 
 import csv
 import functools
@@ -159,6 +159,15 @@ def _rows(name: str) -> list[dict[str, str]]:
     source = importlib.resources.files(__package__) / name
     with source.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def ram_labels(game: str) -> dict[str, int]:
+    """Which bytes of an Atari game's memory hold positions, after AtariARI (Anand et al. 2019).
+
+    Returns:
+        {variable: byte}; empty for a game that nobody has labelled.
+    """
+    return {row["variable"]: int(row["byte"]) for row in _rows("ram_labels.csv") if row["game"] == game}
 
 
 @functools.cache
