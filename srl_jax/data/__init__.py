@@ -48,8 +48,8 @@ class Published(NamedTuple):
             seeds: runs that its score is the mean of; None leaves them out.
 
         Returns:
-            "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not known:
-            sticky actions, seeds", say; "" if nothing differs.
+            "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not
+            known: sticky actions, seeds", say; "" if nothing differs.
         """
         compared = {"sticky actions": (self.sticky_actions, config.sticky_actions)}
         if self.env_steps is not None:

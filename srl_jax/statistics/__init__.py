@@ -27,14 +27,14 @@ from srl_jax.statistics.aggregates import (
     performance_profile,
     probability_of_improvement,
 )
-from srl_jax.statistics.bootstrap import (
+from srl_jax.statistics.curves import Reached, area_under_curve, at_equal_steps, reached, steps_to
+from srl_jax.statistics.intervals import (
     Interval,
     bootstrap,
     bootstrap_difference,
     curve_interval,
     percentile_interval,
 )
-from srl_jax.statistics.curves import Reached, area_under_curve, at_equal_steps, reached, steps_to
 from srl_jax.statistics.table import runs_text, summary
 
 __all__ = [
