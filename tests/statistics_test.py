@@ -157,7 +157,7 @@ def test_intervals_of_pairs_are_rliables_for_the_same_draws():
         reps=100,
     )
     np.random.seed(4)
-    x, y = (np.stack(d) for d in zip(*((_again(SCORES), _again(OTHERS)) for _ in range(100)), strict=True))
+    x, y = (np.stack(d) for d in zip(*((_again(SCORES), _again(OTHERS)) for _ in range(30)), strict=True))
     ours = percentile_interval(probability_of_improvement(x, y))
     np.testing.assert_allclose(ours, limits["pair"][:, 0], atol=1e-12)
 
@@ -268,6 +268,8 @@ def test_curves_meet_where_all_of_them_are():
     steps, returns = at_equal_steps([([5, 15, 25], [1, 3, 9]), ([0, 8, 12, 20, 28], [0, 8, 0, 0, 8])])
     assert steps.tolist() == [5, 15, 25]
     assert returns.tolist() == [[1, 3, 9], [5, 0, 5]]
+    steps, returns = at_equal_steps([([0, 20, 40], [1, 3, 5]), ([10, 20, 30, 40], [7, 8, 9, 0])])
+    assert steps.tolist() == [20, 40] and returns.tolist() == [[3, 5], [8, 0]]
     steps, returns = at_equal_steps([([0, 10], [1, 3]), ([0], [2])])
     assert steps.tolist() == [0] and returns.tolist() == [[1], [2]]
 
