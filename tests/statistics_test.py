@@ -154,7 +154,7 @@ def test_intervals_of_pairs_are_rliables_for_the_same_draws():
     _, limits = library.get_interval_estimates(
         {"pair": (SCORES, OTHERS)},
         lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
-        reps=100,
+        reps=30,
     )
     np.random.seed(4)
     x, y = (np.stack(d) for d in zip(*((_again(SCORES), _again(OTHERS)) for _ in range(30)), strict=True))
@@ -314,6 +314,7 @@ def test_a_summary_has_every_number_with_its_interval_and_its_runs():
     assert by_key["rl_only", "Qbert", "return"]["low"] is None
     better = by_key["joint", None, "probability_of_improvement"]
     assert better["against"] == "rl_only" and better["point"] == pytest.approx((2 + 0.5) / 3)
+    assert by_key["joint", None, "mean_difference"]["point"] == pytest.approx(2 / 3)
     difference = by_key["joint", "Pong", "return_difference"]
     assert difference["point"] == pytest.approx(35.3 * 2 / 3)
     assert difference["low"] <= difference["point"] <= difference["high"]
