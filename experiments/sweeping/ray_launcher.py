@@ -1,26 +1,29 @@
 """Runs as tasks of a Ray cluster, one task a run. Imports no jax, and Ray only when a sweep uses it.
 
 A task gets texts and returns a small dict; everything else goes by way of the sweep's directory, which every
-node sees under the same path, as it does the checkout and the interpreter. Of Ray it takes tasks, resources and
-retries: when a worker or its node is lost, Ray starts the task again elsewhere, and the run goes on from its
-own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a task that
+node sees under the same path, as it does the checkout and the interpreter. Of Ray it takes tasks, resources
+and retries: when a worker or its node is lost, Ray starts the task again elsewhere, and the run goes on from
+its own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a task that
 is started again waits until the run's former process has ended. A file system that nodes share has to
 have such locks, as NFS 4 does; there, those of a node that is lost go when its lease ends.
 """
 
 import importlib.util
 import os
+import signal
 import time
+import uuid
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from experiments.sweeping import attempt, plan, states
+from experiments.sweeping import attempt, machine, manifest, plan, states
 from experiments.sweeping.launching import Ended
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.resolving import CHECKOUT
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from srl_jax.reading import read_bytes
 
 PATIENCE_S = 600.0
 """How long a task waits for another process to leave its run's directory, in seconds."""
@@ -77,15 +80,18 @@ class Ray:
             num_cpus=cpus_per_run, num_gpus=gpus_per_run, max_retries=retries, retry_exceptions=False
         )
         self.flying: dict[Any, str] = {}
+        self.stops = 0
+        self.stop_file = root / "state" / f"stop-{uuid.uuid4().hex}"
         if not self.capacity():
             raise ConfigError(
-                f"--cpus_per_run={cpus_per_run}: no node of the cluster has so many CPUs and {gpus_per_run:g} GPUs"
+                f"--cpus_per_run={cpus_per_run}: no node of the cluster has so many CPUs, and "
+                f"{gpus_per_run:g} GPUs"
             )
         self.where = f"{self.workers} at once on {len(self.nodes())} nodes of Ray"
 
     @property
     def workers(self) -> int:
-        """Runs at once, as far as that is known: nodes come and go."""
+        """Runs at once; it changes where nodes come and go."""
         return self.given or max(self.capacity(), 1)
 
     def nodes(self) -> list[dict]:
@@ -105,8 +111,8 @@ class Ray:
 
     def start(self, entry: Entry) -> None:
         run, config = entry
-        texts = str(CHECKOUT), str(self.root), run.name, self.command(run), config.to_json()
-        self.flying[self.task.remote(*texts, self.cpus, self.gpus)] = run.name
+        texts = str(self.root), run.name, self.command(run), config.to_json(), str(self.stop_file)
+        self.flying[self.task.remote(str(CHECKOUT), *texts, self.cpus, self.gpus)] = run.name
 
     def ended(self) -> list[Ended]:
         if not self.flying:
@@ -118,41 +124,41 @@ class Ray:
             try:
                 told = self.ray.get(reference)
                 found.append(Ended(name, told["status"], told["reason"]))
-            except self.ray.exceptions.TaskCancelledError:
-                found.append(Ended(name, 128 + 15, "stopped"))
-            except (
-                self.ray.exceptions.RayError
-            ) as error:  # lost more often than there are retries, or a mistake
+            except self.ray.exceptions.RayError as error:
+                # Its worker was lost more often than there are retries, or the task has a mistake.
                 line = next(filter(None, str(error).split("\n")), type(error).__name__)
                 found.append(Ended(name, 1, f"{type(error).__name__}: {line:.300}", again=False))
         return found
 
     def stop(self) -> None:
-        for reference in self.flying:
-            self.ray.cancel(reference)
+        # A file, which tasks look for: Ray's way to cancel one is Ctrl-C, to which a sweep that was started in
+        # the background of a script is deaf, and its workers are, too.
+        self.stops += 1
+        manifest.replace(self.stop_file, f"{self.stops}\n")
 
     def close(self) -> None:
+        self.stop_file.unlink(missing_ok=True)
         self.ray.shutdown()
 
 
 def _task() -> Callable[..., dict]:
-    """What a worker executes. Made in a function, so that its code travels and nothing has to be importable."""
+    """What a worker executes. Made in a function, so that its code travels and the worker can find ours."""
 
-    def attempt_run(
-        checkout: str, root: str, name: str, command: list[str], config: str, cpus: int, gpus: float
-    ) -> dict:
+    def attempt_run(checkout: str, *arguments: Any) -> dict:
         import sys
 
         if checkout not in sys.path:
             sys.path.insert(0, checkout)
         from experiments.sweeping.ray_launcher import run_here
 
-        return run_here(root, name, command, config, cpus, gpus)
+        return run_here(*arguments)
 
     return attempt_run
 
 
-def run_here(root: str, name: str, command: list[str], config: str, cpus: int, gpus: float) -> dict:
+def run_here(
+    root: str, name: str, command: list[str], config: str, stop_file: str, cpus: int, gpus: float
+) -> dict:
     """Runs or goes on with a run in this process' own child, and waits for it.
 
     Args:
@@ -160,6 +166,7 @@ def run_here(root: str, name: str, command: list[str], config: str, cpus: int, g
         name: of the run.
         command: its command line.
         config: its configuration, JSON.
+        stop_file: says how often a stop was asked for; none is there before.
         cpus, gpus: that it has.
 
     Returns:
@@ -175,19 +182,28 @@ def run_here(root: str, name: str, command: list[str], config: str, cpus: int, g
         time.sleep(0.5)
     if state.kind == "done":
         return {"status": 0, "reason": ""}
-    child = attempt.Attempt(home, name, command, cpus)
-    while True:
-        try:
-            if (record := child.poll()) is not None:
-                return {"status": record.status, "reason": record.reason}
-            time.sleep(0.1)
-        except KeyboardInterrupt:  # the task was cancelled
+    if _stops(stop_file):
+        return {"status": 128 + signal.SIGTERM, "reason": "stopped"}
+    child, stops = attempt.Attempt(home, name, command, cpus), 0
+    while (record := child.poll()) is None:
+        if _stops(stop_file) > stops:
+            stops += 1
             child.stop()
+        time.sleep(0.2)
+    return {"status": record.status, "reason": record.reason}
+
+
+def _stops(stop_file: str) -> int:
+    """How often a stop was asked for."""
+    try:
+        return int(read_bytes(stop_file, 100))
+    except (OSError, ValueError):
+        return 0
 
 
 def _limit_gpu(gpus: float) -> None:
     """What the run's process shall know of GPUs, in the environment that it inherits."""
-    if not gpus:
+    if not gpus and machine.has_gpu():
         os.environ.setdefault("JAX_PLATFORMS", "cpu")
-    elif gpus < 1:
+    elif 0 < gpus < 1:
         os.environ.setdefault("XLA_PYTHON_CLIENT_MEM_FRACTION", f"{0.9 * gpus:.3f}")
