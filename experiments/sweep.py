@@ -10,6 +10,7 @@ in the thesis. Bad input ends with one line on stderr and exit status 2 before a
 status: 0 if all runs are complete, 1 if one failed, 3 if the disk is full, 128 + n after signal n.
 """
 
+import contextlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -170,9 +171,10 @@ def run_sweep(
             executor = Ray(root, workers, cpus_per_run, gpus_per_run, retries, ray_address, command)
         else:
             executor = local.Local(root, workers, cpus_per_run, command)
-        screen = table.Screen(root, chosen, executor.workers)
-        screen.note(f"{len(chosen)} runs in {root}, {executor.where}")
-        return launching.launch(root, chosen, executor, screen, retries=retries)
+        with contextlib.closing(executor):
+            screen = table.Screen(root, chosen, executor.workers)
+            screen.note(f"{len(chosen)} runs in {root}, {executor.where}")
+            return launching.launch(root, chosen, executor, screen, retries=retries)
 
 
 def check(

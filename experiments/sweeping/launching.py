@@ -39,6 +39,7 @@ class Launcher(Protocol):
     """Executes runs."""
 
     where: str  # said at the start
+    workers: int  # runs at once
 
     def room(self, config: Config) -> bool:
         """Whether one more run can be started now."""
@@ -55,6 +56,9 @@ class Launcher(Protocol):
 
     def stop(self) -> None:
         """Asks what runs to write a checkpoint and to end; `ended` tells when it has."""
+
+    def close(self) -> None:
+        """Called once, when nothing runs any more."""
 
 
 class Outcome(NamedTuple):

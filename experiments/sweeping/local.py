@@ -59,3 +59,6 @@ class Local:
     def stop(self) -> None:
         for attempt, _ in self.attempts.values():
             attempt.stop()
+
+    def close(self) -> None:
+        pass

@@ -180,12 +180,13 @@ class Screen:
         for name in view.running:
             if before is None or view.attempts.get(name) != before.attempts.get(name):
                 record = states.read_record(self.root, name)
-                self.note(f"{name}: started on {where(record)}")
+                self.note(f"{name}: started" + (f" on {where(record)}" if record else ""))
         for name in view.done if before else ():
             if name not in before.done:
                 p = progress(self.root / name)
+                steps = states.look(self.root / name, self.entries[name].config).env_steps
                 score = "" if p.evaluation is None else f", last evaluation {p.evaluation:.4g}"
-                self.note(f"{name}: done, {p.env_steps:,} env steps in {hms(p.seconds)}{score}")
+                self.note(f"{name}: done, {steps:,} env steps in {hms(p.seconds)}{score}")
         for name, why in view.blocked.items():
             if before is None or name not in before.blocked:
                 self.note(f"{name}: blocked: {why}")
