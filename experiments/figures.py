@@ -219,32 +219,44 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     )
 
 
-def main(argv: list[str]) -> int:
-    """The entry point; the exit status is the sweep's."""
-    del argv
-    if not FLAGS.figure:
+def run(values: flags.FlagValues) -> int:
+    """Runs what is missing of the figures that the command line asks for, and draws them.
+
+    Args:
+        values: parsed flags, as `define_flags` defines them.
+
+    Returns:
+        The exit status, the sweep's.
+
+    Raises:
+        ConfigError: the command line is not valid, and nothing was written; or runs cannot be compared.
+        SaveError: a file cannot be written.
+    """
+    if not values["figure"].value:
         raise ConfigError(f"--figure: missing; one of all, {', '.join(FIGURES)}, or a JSON file")
-    figures = figures_named(FLAGS.figure)
-    root = config_flags.check_place("out", FLAGS.out)
-    options = sweep.launcher_options(FLAGS)
-    seeds, games = parse_seeds(FLAGS.seeds), list(dict.fromkeys(FLAGS.games))
-    runs = planned(figures, games, seeds, sweep.given_flags(FLAGS))
-    methods = _known(FLAGS.published)
-    if FLAGS.dry_run:
+    figures = figures_named(values["figure"].value)
+    out = values["out"].value
+    root = config_flags.check_place("out", out)
+    options = sweep.launcher_options(values)
+    seeds, games = parse_seeds(values["seeds"].value), list(dict.fromkeys(values["games"].value))
+    runs = planned(figures, games, seeds, sweep.given_flags(values))
+    methods = _known(values["published"].value)
+    if values["dry_run"].value:
         print("\n".join(sweep.dry_run(root, runs, **options)))
         return 0
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
     status = 0
     try:
-        if not FLAGS.redraw:
+        if not values["redraw"].value:
             status = sweep.run_sweep(root, runs, **options).status
         here = [root / run.name for run in runs if (root / run.name / "config.json").exists()]
         read = [collect.load_run(path) for path in here]
         for figure in figures:
-            print(write(figure, read, games, root / "figures", methods=methods, force=FLAGS.force))
+            how = {"methods": methods, "force": values["force"].value}
+            print(write(figure, read, games, root / "figures", **how))
     except OSError as error:
-        raise SaveError(f"--out={FLAGS.out}: {error.strerror or error}") from error
+        raise SaveError(f"--out={out}: {error.strerror or error}") from error
     return status
 
 
@@ -276,6 +288,12 @@ def _known(text: str) -> list[str]:
         if name not in known:
             raise ConfigError(f"--published={text}: {choices_text(name, known)}")
     return methods
+
+
+def main(argv: list[str]) -> int:
+    """The entry point."""
+    del argv
+    return run(FLAGS)
 
 
 if __name__ == "__main__":

@@ -4,8 +4,10 @@ import json
 
 import numpy as np
 import pytest
+from absl import flags
 
 from experiments import collect, figures
+from experiments import flags as config_flags
 from experiments.arms import FIGURES, Figure, FigureArm
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
@@ -110,6 +112,47 @@ def test_all_figures_share_their_runs():
             assert not source or names.index(source) < names.index(run.name)
     steps = {run.preset.partition("/")[2]: run.flags["steps"] for run in runs}
     assert steps["joint_50"] == "1000" and steps["pretrain_256"] == "300"
+
+
+def _run(*arguments):
+    values = flags.FlagValues()
+    figures.define_flags(values)
+    config_flags.parse(["figures", *arguments], values)
+    return figures.run(values)
+
+
+@pytest.mark.parametrize(
+    "arguments, told",
+    [
+        ([], "--figure: missing; one of all, 6.1"),
+        (["--figure=6.9"], "--figure=6.9: did you mean"),
+        (["--figure=none.json"], "--figure=none.json: No such file"),
+        (["--figure=6.3", "--games=Pnog"], "--games=Pnog: did you mean Pong"),
+        (["--figure=6.3", "--seeds=0"], "--seeds=0: give a number of seeds"),
+        (["--figure=6.3", "--seed=1"], "--seed: a sweep gives it to each run; --seeds decides it"),
+        (["--figure=6.3", "--published=Hunan"], "--published=Hunan: did you mean Human"),
+        (["--figure=6.3", "--gpus_per_run=1"], "--gpus_per_run: only --launcher=ray takes it"),
+        (["--figure=6.3", "--games=Catch", "--redraw"], "no evaluation of any arm of figure 6.3"),
+    ],
+)
+def test_bad_input_is_refused_and_nothing_written(tmp_path, arguments, told):
+    with pytest.raises(ConfigError) as error:
+        _run(*arguments, f"--out={tmp_path / 'new'}")
+    assert str(error.value).startswith(told) and "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
+    pytest.importorskip("matplotlib")
+    (runs / "Catch/a").rename(runs / "Catch/rl_only_nature")
+    (runs / "Catch/b").rename(runs / "Catch/joint_256")
+    assert _run("--figure=6.3", "--games=Catch", "--seeds=2", "--redraw", f"--out={runs}") == 0
+    assert capsys.readouterr().out == f"{runs / 'figures' / '6.3.png'}\n"
+    catch = json.loads((runs / "figures" / "6.3.json").read_text())["games"]["Catch"]
+    assert {arm: values["seeds"] for arm, values in catch["arms"].items()} == {
+        "rl_only_nature": [0, 1],
+        "joint_256": [0, 1],
+    }
 
 
 def test_published_results_say_what_differs():
