@@ -1,6 +1,7 @@
 """The picture that compares arms: a panel a game, mean evaluation return against env steps."""
 
 import os
+import textwrap
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -32,10 +33,17 @@ class Line(NamedTuple):
 
 
 class Level(NamedTuple):
-    """A published result: a horizontal line that says what it is."""
+    """A published result: a horizontal line.
 
-    label: str
+    Attributes:
+        method: whose, at the line.
+        score: where it is.
+        differs: what differs from the runs that are drawn, below the figure; may be empty.
+    """
+
+    method: str
     score: float
+    differs: str = ""
 
 
 class Panel(NamedTuple):
@@ -55,7 +63,7 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
         panels: at least one, with at least one line.
         path: of the PNG file.
         title: of the figure.
-        note: a line below it.
+        note: below it.
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
@@ -91,16 +99,24 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
 
         del handles[known]
         handles[known] = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
-    figure.legend(
+    notes = [note] if note else []
+    for panel in panels:
+        notes += [f"{panel.title}, {x.method}, {x.score:g}: {x.differs}" for x in panel.levels if x.differs]
+    characters = int(17 * width * columns)
+    notes = [line for text in notes for line in textwrap.wrap(text, characters, subsequent_indent="    ")]
+    legend = figure.legend(
         handles.values(),
         handles.keys(),
         loc="outside lower center",
         ncols=1 if columns == 1 else 2,
         fontsize=8,
+        title="\n".join(notes),
+        title_fontsize=7,
+        alignment="left",
+        frameon=False,
     )
+    legend.get_title().set_parse_math(False)
     figure.suptitle(title, fontsize=11).set_parse_math(False)
-    if note:
-        figure.supxlabel(note, fontsize=7.5, color="#555555").set_parse_math(False)
     return plots._save(figure, path)
 
 
@@ -111,10 +127,16 @@ def _seeds(panels: Sequence[Panel], label: str) -> str:
 
 
 def _levels(axes, levels: Sequence[Level], end: float) -> None:
-    """Dotted lines with their names above their left ends."""
-    for level in levels:
+    """Dotted lines, their names side by side along them, so that near ones can be told apart."""
+    for i, level in enumerate(levels):
         axes.axhline(level.score, color="#888888", linestyle=":", linewidth=1)
-        axes.annotate(
-            level.label, (0.01 * end, level.score), xytext=(0, 1.5), textcoords="offset points", fontsize=6,
-            color="#555555", parse_math=False,
-        )  # fmt: skip
+        text = axes.annotate(
+            level.method,
+            (end * (0.01 + i / len(levels)), level.score),
+            xytext=(0, 1.5),
+            textcoords="offset points",
+            fontsize=6.5,
+            color="#555555",
+            parse_math=False,
+        )
+        text.set_in_layout(False)

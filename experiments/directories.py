@@ -41,7 +41,7 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
         raise ConfigError("--resume=auto: goes on with the run that --overwrite deletes; give one of them")
     path = config_flags.check_place("out", out)
     try:
-        if _blank(path):
+        if blank(path):
             return path
         if resume:
             if not _is_run(path):
@@ -65,12 +65,12 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
     return path
 
 
-def _blank(path: Path) -> bool:
+def blank(path: Path) -> bool:
     """Whether nothing lies there, or only what a process left that was killed before it wrote config.json."""
 
     def left(entry: Path) -> bool:
         if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
-            return _blank(entry)
+            return blank(entry)
         return entry.name in (rundir.LOCK, PARTIAL)
 
     return not path.is_dir() or all(left(entry) for entry in path.iterdir())
@@ -147,16 +147,16 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
         ConfigError: another process writes there, or the run has another configuration, or its checkpoints
             are all damaged, or gone though there were some.
     """
-    if _blank(path):
+    if blank(path):
         return None
     rundir.check_free(path)
     if differing := difference(Config.load(path), config):
         raise ConfigError(f"--out={path}: the run there has another configuration: {differing}")
     manifest = checkpoint.newest_good(path, say, at_most)
     if manifest is None:
-        if (reached := _reached(path)) >= _first_checkpoint(config):
+        if (steps := reached(path)) >= first_checkpoint(config):
             raise ConfigError(
-                f"--out={path}: the run there got to {reached} env steps, and there is no checkpoint that it "
+                f"--out={path}: the run there got to {steps} env steps, and there is no checkpoint that it "
                 "could go on from; --overwrite would start anew"
             )
         say(f"{path}: no checkpoint there yet; the run begins again")
@@ -182,7 +182,7 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
         if None in found:
             first, config = runs[found.index(None)]
             for (path, _), manifest in zip(runs, found, strict=True):
-                if manifest and (_blank(first) or manifest.env_steps >= _first_checkpoint(config)):
+                if manifest and (blank(first) or manifest.env_steps >= first_checkpoint(config)):
                     raise ConfigError(
                         f"--out={first}: no checkpoint there to go on from, while {path} has one of "
                         f"{manifest.env_steps} env steps; --overwrite would start all of them anew"
@@ -194,12 +194,12 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
         at_most = min(steps)
 
 
-def _first_checkpoint(config: Config) -> int:
+def first_checkpoint(config: Config) -> int:
     """Env steps at which the first checkpoint is on disk for certain."""
     return (config.checkpoint_every or config.eval_every) + config.num_envs
 
 
-def _reached(path: Path) -> int:
+def reached(path: Path) -> int:
     """The env steps of a run's last row, or 0."""
     try:
         return max((int(row["env_steps"]) for row in read_metrics(path / "metrics.jsonl")), default=0)

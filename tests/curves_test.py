@@ -15,7 +15,7 @@ def _panel(game, **lines):
         curves.Line(name, STEPS, np.full(3, x), np.full(3, x - 1), np.full(3, x + 1), 5, thesis=thesis)
         for name, (x, thesis) in lines.items()
     ]
-    return curves.Panel(game, made, [curves.Level("Human: 9, other protocol", 9.0)])
+    return curves.Panel(game, made, [curves.Level("Human", 9.0, "other protocol")])
 
 
 @pytest.fixture
@@ -43,7 +43,8 @@ def test_every_game_has_a_panel_and_an_arm_one_colour(drawn, tmp_path):
     (legend,) = drawn[0].legends
     told = [text.get_text() for text in legend.get_texts()]
     assert told == ["a (5 seeds)", "b (5 seeds)", "the thesis' own, one run each"]
-    assert "Human: 9, other protocol" in [text.get_text() for text in first.texts]
+    assert [text.get_text() for text in first.texts] == ["Human"]
+    assert "Pong, Human, 9: other protocol" in legend.get_title().get_text()
 
 
 def test_a_band_is_the_interval(drawn, tmp_path):

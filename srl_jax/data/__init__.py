@@ -1,4 +1,4 @@
-"""What others measured, to draw beside one's own: the thesis' curves, scores of humans and of chance."""
+"""What others measured, to draw beside one's own, and where Atari games keep positions in memory."""
 
 import csv
 import functools
@@ -48,8 +48,8 @@ class Published(NamedTuple):
             seeds: runs that its score is the mean of; None leaves them out.
 
         Returns:
-            "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not known:
-            sticky actions, seeds", say; "" if nothing differs.
+            "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not
+            known: sticky actions, seeds", say; "" if nothing differs.
         """
         compared = {"sticky actions": (self.sticky_actions, config.sticky_actions)}
         if self.env_steps is not None:
@@ -159,6 +159,15 @@ def _rows(name: str) -> list[dict[str, str]]:
     source = importlib.resources.files(__package__) / name
     with source.open(encoding="utf-8", newline="") as file:
         return list(csv.DictReader(file))
+
+
+def ram_labels(game: str) -> dict[str, int]:
+    """Which bytes of an Atari game's memory hold positions, after AtariARI (Anand et al. 2019).
+
+    Returns:
+        {variable: byte}; empty for a game that nobody has labelled.
+    """
+    return {row["variable"]: int(row["byte"]) for row in _rows("ram_labels.csv") if row["game"] == game}
 
 
 @functools.cache

@@ -18,6 +18,8 @@ from srl_jax.envs.base import Form, FrameVectorEnv
 GRID = 84
 """The game is played on an integer grid of GRID x GRID, whatever the size of the frames."""
 ACTIONS = ("LEFT", "NOOP", "RIGHT")
+STATE = ("ball_x", "ball_y", "ball_velocity_x", "ball_velocity_y", "paddle_x")
+"""The names of what `info["state"]` holds."""
 
 BALL_RADIUS = 1
 PADDLE_RADIUS = 6
@@ -68,7 +70,12 @@ class Catch(FrameVectorEnv):
     bounce in it), and the column of the paddle's centre. Units are pixels of a frame of 84 x 84,
     counted from 0 at the top left pixel. At size 42, a pixel of Catch is the mean of 2 x 2 of
     these.
+
+    Attributes:
+        state_names: of the numbers in `state`.
     """
+
+    state_names = STATE
 
     def __init__(self, *, num_envs: int, seed: int, size: int = 84, distractor: bool = False):
         """Sets up N games.

@@ -14,7 +14,7 @@ from srl_jax.statistics.aggregates import (
     mean,
     probability_of_improvement,
 )
-from srl_jax.statistics.bootstrap import Interval, bootstrap, difference
+from srl_jax.statistics.intervals import Interval, bootstrap, difference
 
 
 def runs_text(scores: Scores) -> str:
