@@ -1,10 +1,11 @@
 """The pictures of a report, in their sections."""
 
+import functools
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from experiments import collect
+from experiments import collect, diagnostic_plots
 from experiments.collect import RunData
 from experiments.reporting import diagnostics, pictures
 from experiments.reporting.contents import Content, Report, run_name
@@ -18,10 +19,8 @@ MEDIA_BYTES = 5_000_000
 """Of pictures taken from the runs, in all; base64 adds a third."""
 LARGEST_PICTURE, SMALLEST_PICTURE = 400_000, 30_000
 """Bytes that one of them may have where there are few, and may always have."""
-OWN = ("learning_curve", "losses")
-"""Pictures of a run that a report draws better, from all seeds."""
-DRIFT = "drift"
-"""How the names of pictures of drift begin."""
+OWN = ("learning_curve", "losses", "diagnostics", "drift")
+"""Pictures of a run that a report draws itself."""
 
 
 def figures(report: Report) -> Content:
@@ -144,13 +143,13 @@ def _first_runs(report: Report, game: str) -> list[RunData]:
 
 def _panels(run: RunData) -> list[Path]:
     found = sorted((run.path / "figures").glob("*.png"))
-    return [path for path in found if path.stem not in OWN and not path.stem.startswith(DRIFT)]
+    return [path for path in found if path.stem not in OWN]
 
 
 def _limit(report: Report) -> int:
     """Bytes that a picture of a run may have, so that all of them are not too large together."""
     runs = [run for game in report.games for run in _first_runs(report, game)]
-    count = sum(1 + len(list((run.path / "figures").glob("*.png"))) for run in runs)
+    count = sum(1 + len(_panels(run)) for run in runs)
     return min(max(MEDIA_BYTES // max(count, 1), SMALLEST_PICTURE), LARGEST_PICTURE)
 
 
@@ -184,14 +183,14 @@ def diagnostic_pictures(report: Report) -> Content:
 
 
 def _drift(report: Report, game: str) -> Content:
-    """The drift pictures that the first seed of each arm has left."""
-    if not report.media:
-        return None
-    limit = _limit(report)
+    """The error of each epoch's decoder on each epoch's encoder, of each arm's first seed."""
     found = []
     for run in _first_runs(report, game):
-        for path in sorted((run.path / "figures").glob(f"{DRIFT}*.png")):
-            picture = pictures.taken(path, limit)
-            caption = [tag("strong", run.arm), f", seed {run.seed}: {path.stem}"]
-            found.append(figure(picture.source, caption, f"{run_name(run)}: {path.stem}", picture.size))
+        picture = pictures.drawn(functools.partial(diagnostic_plots.drift_matrix, run.rows, title=""))
+        if picture is not None:
+            caption = [
+                tag("strong", run.arm),
+                f", seed {run.seed}: each epoch's decoder on each epoch's encoder",
+            ]
+            found.append(figure(picture.source, caption, f"{run_name(run)}: drift", picture.size))
     return tag("div", found, class_="grid media") if found else None

@@ -52,12 +52,12 @@ def style(index: int) -> tuple[str, str]:
     return plots.COLOURS[index % number], STYLES[index // number % len(STYLES)]
 
 
-def drawn(draw: Callable[[Path], object]) -> Picture:
-    """What a function of the path of a PNG file draws."""
+def drawn(draw: Callable[[Path], object]) -> Picture | None:
+    """What a function of the path of a PNG file draws; None where it writes nothing."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         draw(path)
-        return picture(path.read_bytes(), str(path))
+        return picture(path.read_bytes(), str(path)) if path.exists() else None
 
 
 def picture(data: bytes, name: str) -> Picture:
