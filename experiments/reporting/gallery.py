@@ -9,7 +9,7 @@ from experiments import collect, diagnostic_plots
 from experiments.collect import RunData
 from experiments.reporting import diagnostics, pictures
 from experiments.reporting.contents import Content, Report, run_name
-from experiments.reporting.markup import Markup, figure, listed, plural, tag
+from experiments.reporting.markup import Markup, details, figure, listed, plural, tag
 from srl_jax import statistics
 from srl_jax.data import published
 from srl_jax.errors import ConfigError
@@ -168,18 +168,24 @@ def diagnostic_pictures(report: Report) -> Content:
         found = diagnostics.panels(report.of(game), report.arms)
         if not found:
             continue
-        cells = [
-            figure(panel.picture.source, panel.meaning, f"{game}: {panel.title}", panel.picture.size)
-            for panel in found
-        ]
+        first, others = (
+            [_panel(game, panel) for panel in found if panel.first == at_once] for at_once in (True, False)
+        )
         having = {run.arm for run in report.of(game) if diagnostics.keys_of([run])}
         seeds = {arm: len(report.of(game, arm)) for arm in report.arms if arm in having}
-        parts += [tag("h3", game), _legend(report, seeds), tag("div", cells, class_="grid small")]
+        parts += [tag("h3", game), _legend(report, seeds), tag("div", first, class_="grid small")]
+        if others:
+            more = f"{plural(len(others), 'more picture')} of {game}"
+            parts.append(details(more, tag("div", others, class_="grid small")))
         parts.append(_drift(report, game))
     if without:
         parts.append(tag("p", f"Without diagnostics: {listed(map(run_name, without))}.", class_="note"))
     note = "Measured at every evaluation; means and 95 % intervals over seeds."
     return [tag("p", note, class_="note"), *parts]
+
+
+def _panel(game: str, panel: diagnostics.Panel) -> Markup:
+    return figure(panel.picture.source, panel.meaning, f"{game}: {panel.title}", panel.picture.size)
 
 
 def _drift(report: Report, game: str) -> Content:

@@ -134,6 +134,8 @@ def _last(steps: int, every: int) -> int:
 def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Comparison | None]:
     """Game -> its learning curves at equal steps; None where there is no step that all runs have.
 
+    A run that was evaluated once is left out where others were evaluated more often: it has only just begun.
+
     Raises:
         ConfigError: the evaluations of a run are not in ascending order.
     """
@@ -142,6 +144,7 @@ def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Compariso
         members = [
             run for arm in arms for run in by_arm.get(arm, []) if len(collect.steps_and_returns(run)[0])
         ]
+        members = [run for run in members if len(collect.steps_and_returns(run)[0]) > 1] or members
         if not members:
             continue
         curves = [collect.steps_and_returns(run) for run in members]

@@ -42,7 +42,7 @@ def what_was_run(report: Report) -> Content:
             tag("li", f"{run_name(run)}: {numbers.reached_step(run):,} of {run.config.steps:,} env steps")
             for run in left
         ]
-        how = "not compared" if report.finished_only else "compared as far as they have got"
+        how = "not compared" if report.finished_only else "compared as far as they have been evaluated"
         parts.append(tag("div", tag("strong", f"Not finished, {how}:"), tag("ul", items), class_="warn"))
     if len(revisions) > 1:
         parts.append(tag("p", "The runs are of several revisions of the code.", class_="note"))

@@ -152,8 +152,12 @@ def _as_jpeg(image, size: tuple[int, int]) -> Picture:
 
 
 def interval_curves(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
-    """The mean of several runs' curves and its interval, at steps that all have; None without such."""
+    """The mean of several runs' curves and its interval, at steps that all have; None without such.
+
+    A run with one value is left out where others have more.
+    """
     kept = [(steps, values) for steps, values in runs if len(steps)]
+    kept = [run for run in kept if len(run[0]) > 1] or kept
     if not kept:
         return None
     try:
