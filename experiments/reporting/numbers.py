@@ -83,7 +83,7 @@ def arms_of(runs: Sequence[RunData]) -> list[str]:
     """All arms: those of the presets in their order, then the others; those without a policy last."""
     known = {name.partition("/")[2] or name: i for i, name in reversed(list(enumerate(PRESETS)))}
     playing = {run.arm for run in runs if has_policy(run)}
-    return sorted({run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(known)), a))
+    return sorted({run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(PRESETS)), a))
 
 
 def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None = None) -> str | None:
