@@ -181,7 +181,7 @@ def test_numbers_by_hand(page):
 
 def test_the_sentences_say_what_the_intervals_say(page):
     assert (
-        "rl has 0.31 [0.12, 0.50]. Different from it, by an interval that excludes 0: joint, 0.44 above"
+        "rl has 0.31 [0.12, 0.50]. Above it, by an interval that excludes 0: joint (0.44 [0.25, 0.62])."
         in page.text
     )
     assert "1 arm without an interval" in page.text and "too narrow" in page.text
@@ -368,7 +368,7 @@ def test_in_a_browser(runs, text, tmp_path):
     path = tmp_path / "report.html"
     path.write_text(text)
     desktop, phone = browser.render(path)
-    assert (desktop.width, phone.width) == (1280, 390) and desktop.images[0] == 8
+    assert (desktop.width, phone.width) == (1280, 390) and desktop.images[0] == 9
     assert browser.problems(desktop) == browser.problems(phone) == []
     # What it is to find, it finds.
     wide = '<div style="width: 2000px">x</div><img src="http://127.0.0.1:9/x.png"><script>x()</script>'
