@@ -3,8 +3,8 @@
 A task gets texts and returns a small dict; everything else goes by way of the sweep's directory, which every
 node sees under the same path, as it does the checkout and the interpreter. Of Ray it takes tasks, resources
 and retries: when a worker or its node is lost, Ray starts the task again elsewhere, and the run goes on from
-its own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a task that
-is started again waits until the run's former process has ended. A file system that nodes share has to
+its own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a task
+that is started again waits until the run's former process has ended. A file system that nodes share has to
 have such locks, as NFS 4 does; there, those of a node that is lost go when its lease ends.
 """
 
@@ -131,8 +131,8 @@ class Ray:
         return found
 
     def stop(self) -> None:
-        # A file, which tasks look for: Ray's way to cancel one is Ctrl-C, to which a sweep that was started in
-        # the background of a script is deaf, and its workers are, too.
+        # A file, which tasks look for: Ray's way to cancel one is Ctrl-C, to which a sweep that a script has
+        # started in the background is deaf, and its workers are, too.
         self.stops += 1
         manifest.replace(self.stop_file, f"{self.stops}\n")
 
