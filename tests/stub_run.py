@@ -1,9 +1,9 @@
 """Stands in for a training run where a launcher is tested: quick, and needs nothing but Python.
 
-`python stub_run.py ROOT NAME`, in ROOT. ROOT/stub/NAME.json holds {"config": config.json's text, "acts": [...]}:
-what the first attempt does, the second, and so on; the last one for all that follow. Acts: "end", "kill", "exit:N",
-"raise:N" (prints a line, exits with N), "wait" (until SIGTERM), "lie" (status 0 without being complete),
-"slow" (a second, then the end). ROOT/stub/NAME.attempts and .ends have a line for each.
+`python stub_run.py ROOT NAME`, in ROOT. ROOT/stub/NAME.json holds {"config": what config.json is, "acts":
+what the first attempt does, the second, and so on; the last one for all that follow}. Acts: "end", "kill",
+"exit:N" (prints a line first), "wait" (until SIGTERM), "lie" (status 0 without being complete), "slow" (the
+end, after a while). ROOT/stub/NAME.attempts and .ends have a line for each.
 """
 
 import fcntl
@@ -28,7 +28,13 @@ def complete(name, config):
     with open(f"{folder}.partial/params.msgpack", "wb") as file:
         file.write(b"1234")
     entry = {"bytes": 4, "sha256": hashlib.sha256(b"1234").hexdigest()}
-    about = {"format": 2, "num_actions": 3, "env_steps": 500, "updates": 1, "files": {"params.msgpack": entry}}
+    about = {
+        "format": 2,
+        "num_actions": 3,
+        "env_steps": 500,
+        "updates": 1,
+        "files": {"params.msgpack": entry},
+    }
     text = json.dumps({**about, "config": config}).encode()
     with open(f"{folder}.partial/manifest.json", "wb") as file:
         file.write(text)

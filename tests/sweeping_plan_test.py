@@ -105,7 +105,10 @@ def test_configurations_are_those_that_training_writes():
         (Arm("a", "small/joint_256", {"steps": "0"}), "Catch/a/seed0: --steps=0: must be at least 1"),
         (Arm("a", "small/rl_only_256", {"objective": ("x",)}), "runs no representation loss"),
         (Arm("a", "small/joint_256", {"objective": ("x",)}), "Catch/a/seed0: --objective=x"),
-        (Arm("a", "small/frozen_256", {"encoder": "tiny:features=9"}), "cannot start from Catch/pretrain_256"),
+        (
+            Arm("a", "small/frozen_256", {"encoder": "tiny:features=9"}),
+            "cannot start from Catch/pretrain_256",
+        ),
     ],
 )
 def test_settings_that_cannot_be_run_name_the_run(arm, says):

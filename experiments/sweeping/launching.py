@@ -221,7 +221,7 @@ class _Sweep:
                 if state.kind == "done":
                     self.done.append(name)
                     continue
-                reason, again = f"ended with status 0 and is {state.kind}: {state.reason}", False
+                reason, again = f"ended with status 0 and is {state.kind} {state.reason}".rstrip(), False
             if self.stopping:
                 self.waiting[name] = "stopped"
             elif status == attempt.NO_SPACE:
@@ -250,7 +250,7 @@ class _Sweep:
                 continue
             state = states.prepare(self.root / name, entry.config, self.screen.note)
             if state.kind == "busy":
-                self.ask_again[name] = now + 2.0
+                self.ask_again[name] = now + 1.0
                 self.waiting[name] = state.reason
                 continue
             del self.waiting[name]

@@ -99,7 +99,7 @@ def summary(root: Path, view: View, left: tuple[float, int] | None) -> str:
         if 0 < unknown < total:
             text += f" and {unknown} of unknown speed"
         parts.append(text)
-    return f"{root}: {', '.join(parts)}"
+    return f"{', '.join(parts)} | {root}"
 
 
 class Screen:
