@@ -64,7 +64,8 @@ def disturbed(root: Path, flags: tuple[str, ...], kills: int, draw: random.Rando
     finally:
         cluster.shutdown()
     attempts = sum(states.read_record(root, name).attempts for name in manifest.read(root))
-    return f"{killed} workers killed, a node removed with {lost} runs on it; {attempts} attempts"
+    node = f"a node removed with {lost} runs on it" if lost else "no node removed"
+    return f"{killed} workers killed, {node}; {attempts} attempts in all"
 
 
 def _disturb(

@@ -175,7 +175,7 @@ def launch(
     screen.update(sweep.view(), final=True)
     if sweep.disk:
         raise SaveError(sweep.disk)
-    return Outcome(sweep.done, sweep.failed, sweep.blocked, caught[0] if caught else 0)
+    return Outcome(list(sweep.done), sweep.failed, sweep.blocked, caught[0] if caught else 0)
 
 
 class _Sweep:
@@ -186,7 +186,7 @@ class _Sweep:
         self.retries = retries
         self.waiting = dict.fromkeys(entries, "")
         self.running: list[str] = []
-        self.done: list[str] = []
+        self.done: dict[str, None] = {}
         self.failed: dict[str, str] = {}
         self.blocked: dict[str, str] = {}
         self.attempts: dict[str, int] = {}
@@ -195,7 +195,7 @@ class _Sweep:
         for name, state in look_at_all(root, entries).items():
             if state.kind == "done":
                 self.waiting.pop(name)
-                self.done.append(name)
+                self.done[name] = None
 
     @property
     def over(self) -> bool:
@@ -219,7 +219,7 @@ class _Sweep:
             if status == 0:
                 state = states.look(self.root / name, self.entries[name].config)
                 if state.kind == "done":
-                    self.done.append(name)
+                    self.done[name] = None
                     continue
                 reason, again = f"ended with status 0 and is {state.kind} {state.reason}".rstrip(), False
             if self.stopping:
@@ -255,7 +255,7 @@ class _Sweep:
                 continue
             del self.waiting[name]
             if state.kind == "done":  # another process has ended it
-                self.done.append(name)
+                self.done[name] = None
                 continue
             self.launcher.start(entry)
             self.attempts[name] = self.attempts.get(name, 0) + 1

@@ -81,6 +81,7 @@ class Ray:
         )
         self.flying: dict[Any, str] = {}
         self.stops = 0
+        self.asked_at, self.most = float("-inf"), 1
         self.stop_file = root / "state" / f"stop-{uuid.uuid4().hex}"
         if not self.capacity():
             raise ConfigError(
@@ -92,7 +93,11 @@ class Ray:
     @property
     def workers(self) -> int:
         """Runs at once; it changes where nodes come and go."""
-        return self.given or max(self.capacity(), 1)
+        if self.given:
+            return self.given
+        if time.monotonic() - self.asked_at > 5.0:
+            self.asked_at, self.most = time.monotonic(), max(self.capacity(), 1)
+        return self.most
 
     def nodes(self) -> list[dict]:
         """Resources of the nodes that are alive."""
