@@ -1,4 +1,4 @@
-"""experiments/sweeping/ray_launcher.py: what a worker does; `experiments.soak --only=cluster` has a cluster."""
+"""experiments/sweeping/ray_launcher.py: what a worker does; `experiments.soak` has a cluster."""
 
 import importlib.util
 import json
@@ -68,18 +68,16 @@ def test_without_ray_one_line_says_what_to_install(tmp_path, monkeypatch):
 
 
 def test_the_task_needs_nothing_but_its_texts(tmp_path):
-    """A worker has neither the checkout on its path nor our modules: the function that travels imports them."""
-    (tmp_path / "experiments" / "sweeping").mkdir(parents=True)
-    (tmp_path / "experiments" / "sweeping" / "ray_launcher.py").write_text(
-        "def run_here(*x): return {'got': x}"
-    )
+    """A worker does not have the checkout on its path: the function that travels puts it there."""
+    module = tmp_path / "experiments" / "sweeping" / "ray_launcher.py"
+    module.parent.mkdir(parents=True)
+    module.write_text("def run_here(*x): return {'got': x}")
     code = (
         "import json, marshal, sys, types; "
         "task = types.FunctionType(marshal.loads(bytes.fromhex(sys.argv[1])), {}); "
         "print(json.dumps(task(sys.argv[2], 'a', 1)))"
     )
     task = marshal.dumps(ray_launcher._task().__code__).hex()
-    done = subprocess.run(
-        [sys.executable, "-S", "-c", code, task, str(tmp_path)], capture_output=True, text=True
-    )
-    assert json.loads(done.stdout) == {"got": ["a", 1]}, done.stderr
+    line = [sys.executable, "-I", "-c", code, task, str(tmp_path)]
+    done = subprocess.run(line, capture_output=True, text=True)
+    assert json.loads(done.stdout or "{}") == {"got": ["a", 1]}, done.stderr
