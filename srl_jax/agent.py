@@ -9,6 +9,7 @@ import jax.numpy as jnp
 
 from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
+from srl_jax.diagnostics.device import Functions, make_functions
 from srl_jax.modes import MODES, Mode, encoder_learning_rate
 from srl_jax.optim import RL, make_optimizer, real_copy
 from srl_jax.rl import Algorithm
@@ -99,6 +100,7 @@ class Agent(NamedTuple):
         export: state -> this seed's `TrainState`.
         adopt: `TrainState` of arrays on the host or the device -> a state of copies.
         hyper: the numbers of an update.
+        measures: what `srl_jax.diagnostics` asks of the device; of one seed's state.
     """
 
     mode: Mode
@@ -119,6 +121,7 @@ class Agent(NamedTuple):
     export: Callable
     adopt: Callable
     hyper: Hyper
+    measures: Functions
 
 
 def make_agent(config: Config, num_actions: int) -> Agent:
@@ -197,5 +200,8 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         hyper=Hyper(
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},
+        ),
+        measures=make_functions(
+            encoder, terms, mode, augment=config.augment, target_encoder=config.target_encoder
         ),
     )

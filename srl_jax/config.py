@@ -131,6 +131,13 @@ class Config:
         int, 0, "the encoder of every so manyth checkpoint is kept in encoders/; 0: none", "checkpoints",
         minimum=0,
     )  # fmt: skip
+    diagnostics: bool = _value(
+        bool, True, "measure the latent at each evaluation: drift, rank, gradient conflict, probes"
+    )
+    diagnostics_kept: int = _value(
+        int, 10, "how many epochs' encoders and decoders are kept in encoders/, to measure drift against",
+        "epochs", minimum=0, maximum=1_000,
+    )  # fmt: skip
     tensorboard: bool = _value(bool, False, "also write TensorBoard events")
 
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")

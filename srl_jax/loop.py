@@ -23,6 +23,7 @@ from srl_jax import checkpoint, envs, snapshot
 from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
+from srl_jax.diagnostics.measure import Diagnostics
 from srl_jax.errors import ConfigError, Diverged
 from srl_jax.evaluate import Evaluation, evaluate
 from srl_jax.replay import Replay
@@ -51,12 +52,20 @@ class Result(NamedTuple):
 
 
 class Evaluating(NamedTuple):
-    """An evaluation under way: its result to come, and the policy's parameters, env steps and updates."""
+    """An evaluation under way.
+
+    Attributes:
+        future: its result to come.
+        params: of the policy.
+        env_steps, updates: when the run had them.
+        diagnosed: what `srl_jax.diagnostics` says of that moment; JSON values.
+    """
 
     future: Future
     params: Params
     env_steps: int
     updates: int
+    diagnosed: dict[str, Any]
 
 
 def train(
@@ -197,6 +206,11 @@ class Run:
         self.report = Report(
             out, config.steps, self.agent.fetch, progress=progress, tensorboard=config.tensorboard
         )
+        self.diagnostics: Diagnostics | None = None
+        if config.diagnostics:
+            self.diagnostics = Diagnostics(
+                config, self.agent.measures, self.agent.horizon, out, self.report.progress.note
+            )
         self.saved: checkpoint.Manifest | None = None  # the newest checkpoint
         self.saved_position = self.replay.next_position.copy()  # replay's, when it was written
         self.resumed = resume is not None
@@ -229,7 +243,7 @@ class Run:
         config = self.config
         if not self.resumed:
             self.start()
-            self.start_evaluation(self.state.params, 0, 0)
+            self.start_evaluation(self.state.params, 0, 0, self.diagnose())
         while self.env_steps < config.steps and not self.solved:
             if self.agent.agree(self.stop()):
                 self.save()
@@ -247,7 +261,8 @@ class Run:
             if rows[0]:
                 self.write_train_row()
             if rows[1]:
-                self.start_evaluation(self.state.params, self.env_steps, self.updates)
+                diagnosed = self.diagnose()
+                self.start_evaluation(self.state.params, self.env_steps, self.updates, diagnosed)
             if self.passed(before, self.checkpoint_every) and self.env_steps < config.steps:
                 self.keep_encoder()  # first: a run that goes on from the checkpoint does not write it again
                 self.save()
@@ -385,17 +400,41 @@ class Run:
                 "the checkpoints are from before"
             )
 
-    def start_evaluation(self, params: Params, env_steps: int, updates: int) -> None:
+    def diagnose(self) -> dict[str, Any]:
+        """What `srl_jax.diagnostics` says of the run as it is now; changes nothing of it.
+
+        Keeps the encoder and the decoders, if this evaluation is one of those whose are kept.
+        """
+        config, diagnostics = self.config, self.diagnostics
+        if diagnostics is None:
+            return {}
+        self.check_losses()
+        window = None
+        if self.agent.measures.conflict is not None and len(self.replay):
+            rng = np.random.default_rng(seed_for(config.seed, "diagnostics", self.env_steps))
+            window, _ = self.replay.sample(config.batch_size, self.beta, rng)
+        state = self.agent.export(self.state)
+        values = diagnostics.measure(state, self.env_steps, window, self.hyper)
+        if self.env_steps in diagnostics.steps:
+            self.save_parameters("encoders", diagnostics.parts(state.params), keep=0)
+        return values
+
+    def start_evaluation(
+        self, params: Params, env_steps: int, updates: int, diagnosed: dict[str, Any]
+    ) -> None:
         """Has the policy of these parameters evaluated, in a thread, while training goes on.
 
-        Nothing happens in a mode without RL.
+        In a mode without RL nothing is played, and a row of the diagnostics is written.
 
         Args:
             params: which nothing changes.
             env_steps, updates: when the run had them.
+            diagnosed: from `diagnose`, of that moment.
         """
         config = self.config
         if not self.agent.mode.rl:
+            if diagnosed:
+                self.report.eval_row(env_steps, updates, diagnosed)
             return
         policy = greedy_policy(self.agent, params, self.eval_key)
         seed = seed_for(config.seed, "eval", env_steps)
@@ -416,7 +455,8 @@ class Run:
             )
             return played, time.perf_counter() - began
 
-        self.evaluating = Evaluating(self.eval_thread.submit(play), params, env_steps, updates)
+        future = self.eval_thread.submit(play)
+        self.evaluating = Evaluating(future, params, env_steps, updates, diagnosed)
 
     def finish_evaluation(self) -> None:
         """Waits for the evaluation that is under way, writes its row; sets `solved`.
@@ -425,7 +465,7 @@ class Run:
         """
         if self.evaluating is None:
             return
-        (future, _, env_steps, updates), self.evaluating = self.evaluating, None
+        (future, _, env_steps, updates, diagnosed), self.evaluating = self.evaluating, None
         played, seconds = future.result()
         mean = float(np.mean(played.returns))
         values = {
@@ -433,7 +473,7 @@ class Run:
             "eval/returns": played.returns,
             "eval/lengths": played.lengths,
             "wall_eval_s": round(seconds, 3),
-        }
+        } | diagnosed
         self.report.eval_row(env_steps, updates, values)
         self.report.progress.note(
             f"evaluation after {env_steps} env steps: mean return {mean:.2f} "
@@ -463,6 +503,8 @@ class Run:
     def keep_encoder(self) -> None:
         """Writes the encoder, if the checkpoint that is due is one of every so many."""
         every = self.config.keep_encoder_every
+        if self.diagnostics is not None and self.env_steps in self.diagnostics.steps:
+            return  # it is there already
         if every and self.env_steps // self.checkpoint_every % every == 0:
             self.check_losses()
             self.save_parameters("encoders", {"encoder": self.state.params["encoder"], "heads": {}}, keep=0)

@@ -198,13 +198,16 @@ class Replay:
         self.active &= ~ended
         self.num_transitions += self.num_streams
 
-    def sample(self, batch_size: int, beta: float) -> tuple[Window, np.ndarray]:
+    def sample(
+        self, batch_size: int, beta: float, rng: np.random.Generator | None = None
+    ) -> tuple[Window, np.ndarray]:
         """Draws windows in proportion to their priorities, stratified.
 
         Args:
             batch_size: B.
             beta: exponent of the importance weights (N_sampleable * p_i / sum p) ** -beta, divided by the
                 batch's largest.
+            rng: draws in place of the replay's own, which is then left as it is.
 
         Returns:
             The Window, of arrays that nothing else refers to, and int64 [B] indices, one a row, for
@@ -215,7 +218,7 @@ class Replay:
         """
         if batch_size < 1 or not self.num_sampleable:
             raise ValueError(f"cannot draw {batch_size} of {self.num_sampleable} transitions")
-        leaves = self.tree.sample_stratified(batch_size, self.rng)
+        leaves = self.tree.sample_stratified(batch_size, self.rng if rng is None else rng)
         priority = self.tree.get(leaves)
         # The number of transitions and the sum of priorities cancel when divided by the largest weight.
         weight = ((priority.min() / priority) ** beta).astype(np.float32)

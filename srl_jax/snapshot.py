@@ -12,6 +12,7 @@ import numpy as np
 
 from srl_jax import checkpoint
 from srl_jax.checkpoint import Manifest, State
+from srl_jax.diagnostics.measure import check_diagnosed
 from srl_jax.errors import ConfigError
 from srl_jax.optim import real_copy
 
@@ -33,7 +34,11 @@ def take(run: "Run") -> State:
     arrays |= {f"env_{name}": x for name, x in run.env.snapshot().items()}
     evaluating = None
     if run.evaluating is not None:
-        evaluating = {"env_steps": run.evaluating.env_steps, "updates": run.evaluating.updates}
+        evaluating = {
+            "env_steps": run.evaluating.env_steps,
+            "updates": run.evaluating.updates,
+            "diagnosed": run.evaluating.diagnosed,
+        }
         if evaluating["updates"] != run.updates:  # else its parameters are those of now
             trees["evaluation"] = run.evaluating.params
     unchanged = set()
@@ -127,7 +132,9 @@ def _put(run: "Run", manifest: Manifest, numbers: dict[str, Any]) -> None:
         policy = params
         if updates != run.updates:
             policy = checkpoint.load_into(shapes.params, checkpoint.load_tree(manifest, "evaluation"), where)
-        run.start_evaluation(real_copy(policy), env_steps, updates)
+        # Runs from before there were diagnostics have none.
+        diagnosed = check_diagnosed(evaluating.get("diagnosed", {}))
+        run.start_evaluation(real_copy(policy), env_steps, updates, diagnosed)
 
 
 def chunks(replay: Any) -> list[tuple[str, slice]]:

@@ -1,4 +1,4 @@
-"""make_init, make_update and make_act: the one place where losses are summed."""
+"""make_init, make_update, make_conflict and make_act: the one place where losses are summed."""
 
 import math
 import zlib
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from srl_jax.augment import random_shift
 from srl_jax.modes import Mode
@@ -190,34 +191,15 @@ def make_update(
         raise ValueError(f"target_encoder must be slow or online, not {target_encoder}")
 
     active = {n: o for n, o in objectives.items() if only is None or n in only}
+    losses_of = make_losses(encoder, active, mode, augment=augment, target_encoder=target_encoder)
 
     def update(state: TrainState, window: Window, hyper: Hyper):
         if set(hyper.weights) != set(objectives):
             raise ValueError(f"weights {sorted(hyper.weights)} for losses {sorted(objectives)}")
-        key = jax.random.fold_in(state.key, state.step)
-        shifted = window if augment == "none" else shift(window, named_key(key, "augment"))
-        rl_view = window if augment == "srl" else shifted
         trainable, still = split(state.params, mode, active)
 
         def summed(trainable: Params):
-            params = join(trainable, still)
-            slow = state.slow["encoder"] if target_encoder == "slow" else params["encoder"]
-            seen = make_latents(encoder, params["encoder"], slow, shifted)
-            rl_seen = make_latents(encoder, params["encoder"], slow, rl_view)
-            if rl_view is shifted:
-                rl_seen = seen
-            losses, metrics = {}, {}
-            for name, objective in active.items():
-                view, latents, opens = shifted, seen, mode.representation_trains_encoder
-                if name == RL:
-                    view, latents, opens = rl_view, rl_seen, mode.rl_trains_encoder
-                losses[name], metrics[name] = objective.loss(
-                    params["heads"][name],
-                    state.slow["heads"].get(name),
-                    latents if opens else shut(latents),
-                    view,
-                    named_key(key, name),
-                )
+            losses, metrics = losses_of(join(trainable, still), state, window)
             total = sum(hyper.weights[name] * jnp.mean(losses[name]) for name in losses)
             return total, (losses, metrics)
 
@@ -235,6 +217,83 @@ def make_update(
         return TrainState(params, slow, opt_state, step, state.key), td_error, metrics
 
     return update
+
+
+def make_losses(
+    encoder: Encoder,
+    objectives: dict[str, Objective],
+    mode: Mode,
+    *,
+    augment: str,
+    target_encoder: str,
+) -> Callable:
+    """losses: (params, TrainState, Window) -> ({name: losses [B]}, {name: metrics}), pure; see `make_update`.
+
+    Everything but the parameters comes from the state: slow copies, and the key of the update that is next.
+    """
+
+    def losses_of(params: Params, state: TrainState, window: Window):
+        key = jax.random.fold_in(state.key, state.step)
+        shifted = window if augment == "none" else shift(window, named_key(key, "augment"))
+        rl_view = window if augment == "srl" else shifted
+        slow = state.slow["encoder"] if target_encoder == "slow" else params["encoder"]
+        seen = make_latents(encoder, params["encoder"], slow, shifted)
+        rl_seen = seen if rl_view is shifted else make_latents(encoder, params["encoder"], slow, rl_view)
+        losses, metrics = {}, {}
+        for name, objective in objectives.items():
+            view, latents, opens = shifted, seen, mode.representation_trains_encoder
+            if name == RL:
+                view, latents, opens = rl_view, rl_seen, mode.rl_trains_encoder
+            losses[name], metrics[name] = objective.loss(
+                params["heads"][name],
+                state.slow["heads"].get(name),
+                latents if opens else shut(latents),
+                view,
+                named_key(key, name),
+            )
+        return losses, metrics
+
+    return losses_of
+
+
+def make_conflict(
+    encoder: Encoder,
+    objectives: dict[str, Objective],
+    mode: Mode,
+    *,
+    augment: str,
+    target_encoder: str,
+) -> Callable:
+    """conflict: (TrainState, Window, Hyper) -> {name: (cosine, norm ratio)}, pure; for each but RL.
+
+    The cosine of an objective's gradient on the encoder's parameters with RL's, and its norm over RL's norm,
+    both gradients of `weight * mean(losses)`. Every loss's gradient enters the encoder here, whatever the
+    mode: in mode decoupled it is the gradient that RL's would be.
+    """
+    both = mode._replace(rl_trains_encoder=True, representation_trains_encoder=True)
+
+    def conflict(state: TrainState, window: Window, hyper: Hyper):
+        def gradient(name: str) -> Params:
+            losses_of = make_losses(
+                encoder, {name: objectives[name]}, both, augment=augment, target_encoder=target_encoder
+            )
+
+            def loss(tree: Params) -> Array:
+                losses, _ = losses_of({**state.params, "encoder": tree}, state, window)
+                return hyper.weights[name] * jnp.mean(losses[name])
+
+            return jax.grad(loss)(state.params["encoder"])
+
+        of_rl = gradient(RL)
+        norm = optax.tree.norm(of_rl)
+        found = {}
+        for name in sorted(objectives.keys() - {RL}):
+            other = gradient(name)
+            other_norm = optax.tree.norm(other)
+            found[name] = optax.tree.vdot(of_rl, other) / (norm * other_norm), other_norm / norm
+        return found
+
+    return conflict
 
 
 def follow(objectives: dict[str, Objective], params: Params, slow: Params, step: Array) -> Params:

@@ -1,11 +1,15 @@
 """What several tests share: an encoder that compiles quickly, random windows, comparisons of trees."""
 
+import dataclasses
+import json
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from srl_jax.config import Config
 from srl_jax.types import Context, Decoder, Encoder, TrainState, Window
 from srl_jax.window import to_unit
 
@@ -27,6 +31,7 @@ SMALL = {
     "eval_every": 120,
     "eval_games": 3,
     "slow_update_every": 5,
+    "diagnostics": False,
 }
 JOINT = {"mode": "joint", "objectives": ("reconstruction", "latent_l2")}
 """Settings of short runs: whole ones share what jax compiles, as far as they can."""
@@ -147,3 +152,24 @@ def zero_leaves(tree) -> list[str]:
     """The names of the leaves that are zero throughout."""
     leaves = jax.tree_util.tree_leaves_with_path(tree)
     return [jax.tree_util.keystr(path) for path, x in leaves if not np.any(np.asarray(x))]
+
+
+def write_run(path: Path, returns=(1.0, 2.0), every: int = 100, **values) -> Path:
+    """A run directory as training leaves it, less its checkpoints: evaluations every so many env steps.
+
+    Args:
+        path: to make.
+        returns: mean return of each evaluation.
+        every: env steps between two.
+        **values: fields of its Config.
+    """
+    path.mkdir(parents=True)
+    config = Config(**{"game": "Catch", "frame_size": 42, **values})
+    (path / "config.json").write_text(json.dumps({**dataclasses.asdict(config), "versions": {}}))
+    rows = [
+        {"kind": "eval", "env_steps": every * i, "updates": i, "wall_s": 0.5, "eval/return_mean": x}
+        for i, x in enumerate(returns)
+    ]
+    rows.insert(1, {"kind": "train", "env_steps": every // 2, "updates": 0, "wall_s": 0.1})
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return path

@@ -40,12 +40,12 @@ def whole(path):
 def joint(tmp_path_factory):
     """One joint run that the tests below look at, and start from."""
     path = tmp_path_factory.mktemp("runs") / "joint"
-    return path, train(path, **JOINT, seed=3)
+    return path, train(path, **JOINT, seed=3, diagnostics=True)
 
 
 def test_same_seed_same_metrics(joint, tmp_path):
     path, _ = joint
-    train(tmp_path / "again", **JOINT, seed=3)
+    train(tmp_path / "again", **JOINT, seed=3, diagnostics=True)
     train(tmp_path / "other", **JOINT, seed=4)
 
     def rows(p):
@@ -53,11 +53,16 @@ def test_same_seed_same_metrics(joint, tmp_path):
 
     assert rows(path) == rows(tmp_path / "again")
     assert rows(path) != rows(tmp_path / "other")
-    first, second = (checkpoint.read_manifest(p).files for p in (path, tmp_path / "again"))
-    assert first == second  # the same sha256: parameters are bit-identical
+    assert files_of(path) == files_of(tmp_path / "again")
+    assert {folder.name for folder in (path / "encoders").iterdir()} == {"000000000", "000000120"}
 
 
-def test_timing_changes_nothing(joint, tmp_path, monkeypatch):
+def files_of(path):
+    """Every file of parameters that a run leaves, with its sha256: equal ones are bit-identical."""
+    return {p.relative_to(path): checkpoint.read_manifest(p).files for p in path.glob("*/0*")}
+
+
+def test_neither_timing_nor_diagnostics_change_anything(joint, tmp_path, monkeypatch):
     path, _ = joint
     rng, act_and_step, update = np.random.default_rng(0), loop.act_and_step, loop.Run.update
 
@@ -74,10 +79,13 @@ def test_timing_changes_nothing(joint, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "act_and_step", slow_step)
     monkeypatch.setattr(loop.Run, "update", slow_update)
     train(tmp_path / "again", **JOINT, seed=3)
-    ours, theirs = (checkpoint.read_manifest(p).files for p in (tmp_path / "again", path))
-    assert ours == theirs  # the same sha256
-    rows = [[strip_wall(r) for r in read_metrics(p / "metrics.jsonl")] for p in (tmp_path / "again", path)]
-    assert rows[0] == rows[1]
+    ours, theirs = files_of(tmp_path / "again"), files_of(path)
+    assert ours == {name: sums for name, sums in theirs.items() if name.parent.name == "checkpoints"}
+    rows, diagnosed = (
+        [strip_wall(row) for row in read_metrics(p / "metrics.jsonl")] for p in (tmp_path / "again", path)
+    )
+    kept = [{key: x for key, x in row.items() if not key.startswith("diag/")} for row in diagnosed]
+    assert kept == rows != diagnosed
 
 
 def test_representation_losses_in_every_third_update(tmp_path, monkeypatch):

@@ -22,9 +22,14 @@ from tests.rundir_test import contents
 
 MODES = {
     "rl_only": {},
-    "joint": {"mode": "joint", "objectives": ("inverse",), "srl_every": 2, "game": "CatchDistractor"},
-    "pretrain": {"mode": "pretrain", "objectives": ("inverse",)},
-}
+    "joint": {
+        "mode": "joint", "objectives": ("inverse", "reconstruction"), "srl_every": 2,
+        "game": "CatchDistractor", "diagnostics": True, "diagnostics_kept": 2,
+    },
+    "pretrain": {"mode": "pretrain", "objectives": ("inverse",), "diagnostics": True},
+}  # fmt: skip
+ENCODERS = {"rl_only": [104], "joint": [0, 60, 104], "pretrain": [0, 60, 104, 120]}
+"""Of every second checkpoint, which is that of 104, and what diagnostics keep."""
 EVERY = {"steps": 200, "log_every": 40, "eval_every": 60, "checkpoint_every": 52, "eval_games": 5}
 
 
@@ -42,6 +47,7 @@ def make_run(config, path, **options):
     """A run whose agent is compiled once for all runs of a mode."""
     path.mkdir(exist_ok=True)
     no_matter = {"steps": 1, "stop_at_return": None, "checkpoint_every": 0, "keep_encoder_every": 0}
+    no_matter |= {"diagnostics": False, "diagnostics_kept": 0}
     return loop.Run(config, path, False, agent_of(dataclasses.replace(config, **no_matter)), **options)
 
 
@@ -128,10 +134,13 @@ def test_a_run_that_is_stopped_and_goes_on_is_the_run_that_was_not(whole, tmp_pa
     assert not stopped.interrupted
     assert {name for name in whole_end if end[name] != whole_end[name]} == set()
     assert rows(path) == rows(whole_path)
-    # Parameters alone, and the encoder of every second checkpoint: of 104, which is the second one.
+    # Parameters alone, of the last two checkpoints; and encoders.
     ours, folders = files(path)
     assert ours == files(whole_path)[0]
-    assert [f.name for f in folders if f.parent.name == "encoders"] == ["000000104"]
+    kept = [f for f in folders if f.parent.name == "encoders"]
+    assert [int(f.name) for f in kept] == ENCODERS[mode]
+    ours, theirs = ([checkpoint.read_manifest(p / f).files for f in kept] for p in (path, whole_path))
+    assert ours == theirs
     assert all(set(checkpoint.read_manifest(path / f).files) == {"params.msgpack"} for f in folders)
 
 
@@ -209,13 +218,14 @@ OF_THE_CONFIGURATION = {
     "act_key", "eval_key",
 }  # fmt: skip
 OF_THE_PROCESS = {"env_thread", "eval_thread", "eval_env", "stopped", "resumed"}
+IN_ENCODERS = {"diagnostics"}
 
 
 def test_every_attribute_of_a_run_is_taken_or_follows_from_the_configuration(tmp_path):
     # A new one has to be written and read by srl_jax.snapshot, if it changes while a run runs.
     run = make_run(make_config("rl_only"), tmp_path / "run")
     run.env_thread.shutdown()
-    assert set(vars(run)) == IN_THE_SNAPSHOT | OF_THE_CONFIGURATION | OF_THE_PROCESS
+    assert set(vars(run)) == IN_THE_SNAPSHOT | OF_THE_CONFIGURATION | OF_THE_PROCESS | IN_ENCODERS
 
 
 # Snapshots that somebody has made up: the sums fit
@@ -323,6 +333,8 @@ def test_numbers_that_were_changed_are_refused_or_possible(put):
         values = (None, "REMOVED", [], {}, "x", -1, 1.5, 10**400)
         if len(path) > 1 and path[0] in ("replay", "report"):  # whose own tests try more
             values = (None, 10**400)
+        elif path[:2] == ("evaluating", "diagnosed") and len(path) > 2:  # null and other numbers may be there
+            values = ("x", 10**400)
         for new in values:
             if path or new != "REMOVED":
                 replace(put.folder, "run.json", json.dumps(changed(numbers, path, new)).encode())

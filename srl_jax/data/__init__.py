@@ -1,10 +1,74 @@
-"""The learning curves of the thesis, to draw beside one's own."""
+"""What others measured, to draw beside one's own, and where Atari games keep positions in memory."""
 
 import csv
 import functools
 import importlib.resources
+from typing import NamedTuple
 
 import numpy as np
+
+from srl_jax.config import Config
+
+
+class Published(NamedTuple):
+    """A published score of one method in one game; None: not known here.
+
+    Attributes:
+        game: the Atari game.
+        method: its name.
+        env_steps: agent decisions, 4 emulator frames each, that it learned from; None for Random and Human.
+        score: raw, the mean over seeds.
+        spread: standard deviation over seeds, or what the source gives after a plus-minus.
+        seeds: runs that the score is the mean of.
+        score_of: "training", "evaluation", or "best evaluation": the highest one of the run.
+        sticky_actions: probability.
+        epsilon: of the policy whose score it is.
+        protocol: what else there is to say.
+        source: paper and table, or repository and file.
+    """
+
+    game: str
+    method: str
+    env_steps: int | None
+    score: float
+    spread: float | None
+    seeds: int | None
+    score_of: str | None
+    sticky_actions: float | None
+    epsilon: float | None
+    protocol: str
+    source: str
+
+    def differs_from(self, config: Config, env_steps: int | None = None, seeds: int | None = None) -> str:
+        """One line on what differs from the evaluations of a run, to be shown wherever both are.
+
+        Args:
+            config: of the run.
+            env_steps: when it was evaluated; by default at its end.
+            seeds: runs that its score is the mean of; None leaves them out.
+
+        Returns:
+            "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not
+            known: sticky actions, seeds", say; "" if nothing differs.
+        """
+        compared = {"sticky actions": (self.sticky_actions, config.sticky_actions)}
+        if self.env_steps is not None:
+            compared |= {
+                "env steps": (self.env_steps, config.steps if env_steps is None else env_steps),
+                "epsilon": (self.epsilon, config.eps_eval),
+                "seeds": (self.seeds, self.seeds if seeds is None else seeds),
+            }
+        texts = [
+            f"{name} {there:,} (here {here:,})"
+            for name, (there, here) in compared.items()
+            if there not in (None, here)
+        ]
+        if self.score_of not in (None, "evaluation"):
+            texts.append(f"{self.score_of} score (here the mean of {config.eval_games} evaluation games)")
+        unknown = [name for name, (there, _) in compared.items() if there is None]
+        unknown += ["kind of score"] if self.score_of is None else []
+        parts = [", ".join(texts), f"not known: {', '.join(unknown)}" if unknown else ""]
+        return "; ".join(part for part in parts if part)
 
 
 def thesis_curve(figure: str, game: str, arm: str) -> tuple[np.ndarray, np.ndarray]:
@@ -37,14 +101,80 @@ def thesis_curve(figure: str, game: str, arm: str) -> tuple[np.ndarray, np.ndarr
     return np.array(steps, np.int64), np.array(returns, np.float64)
 
 
+def reference_scores(game: str) -> tuple[float, float]:
+    """The raw scores that count as 0 and 1: a random policy's and a human's; a miss and a catch in Catch.
+
+    Args:
+        game: an Atari-57 game, Catch or CatchDistractor.
+
+    Raises:
+        ValueError: the game is none of them.
+    """
+    scores = _reference_scores()
+    if game not in scores:
+        raise ValueError(f"no reference scores for game {game}; there are some for {', '.join(scores)}")
+    return scores[game]
+
+
+def published(game: str) -> list[Published]:
+    """Published scores of a game, Random and Human first; [] for one that has none.
+
+    Args:
+        game: "Pong", say; seven Atari games have results of learned policies.
+    """
+    rows = [
+        row | {"method": name, "score": row[name.lower()], "score_of": "evaluation", "protocol": _NO_OPS}
+        for row in _rows("atari_scores.csv")
+        if row["game"] == game and row["source"] == _DQN_ZOO
+        for name in ("Random", "Human")
+    ]
+    rows += [row for row in _rows("published.csv") if row["game"] == game]
+    return [
+        Published(
+            *(_KINDS.get(name, str)(row[name]) if row.get(name) else None for name in Published._fields)
+        )
+        for row in rows
+    ]
+
+
+_KINDS = {
+    "env_steps": int,
+    "score": float,
+    "spread": float,
+    "seeds": int,
+    "sticky_actions": float,
+    "epsilon": float,
+}
+_DQN_ZOO = "google-deepmind/dqn_zoo dqn_zoo/atari_data.py"
+_NO_OPS = "mean of at least 3 games of at most 108,000 frames, after up to 30 no-ops"
+
+
+@functools.cache
+def _reference_scores() -> dict[str, tuple[float, float]]:
+    return {row["game"]: (float(row["random"]), float(row["human"])) for row in _rows("atari_scores.csv")}
+
+
+@functools.cache
+def _rows(name: str) -> list[dict[str, str]]:
+    source = importlib.resources.files(__package__) / name
+    with source.open(encoding="utf-8", newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def ram_labels(game: str) -> dict[str, int]:
+    """Which bytes of an Atari game's memory hold positions, after AtariARI (Anand et al. 2019).
+
+    Returns:
+        {variable: byte}; empty for a game that nobody has labelled.
+    """
+    return {row["variable"]: int(row["byte"]) for row in _rows("ram_labels.csv") if row["game"] == game}
+
+
 @functools.cache
 def _curves() -> dict[tuple[str, str, str], tuple[list[int], list[float]]]:
-    source = importlib.resources.files(__package__) / "thesis_curves.csv"
     curves: dict[tuple[str, str, str], tuple[list[int], list[float]]] = {}
-    with source.open(encoding="utf-8", newline="") as file:
-        for row in csv.DictReader(file):
-            key = row["figure"], row["game"], row["arm"]
-            steps, returns = curves.setdefault(key, ([], []))
-            steps.append(int(row["env_steps"]))
-            returns.append(float(row["mean_return"]))
+    for row in _rows("thesis_curves.csv"):
+        steps, returns = curves.setdefault((row["figure"], row["game"], row["arm"]), ([], []))
+        steps.append(int(row["env_steps"]))
+        returns.append(float(row["mean_return"]))
     return curves

@@ -1,0 +1,142 @@
+"""The picture that compares arms: a panel a game, mean evaluation return against env steps."""
+
+import os
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments import plots
+
+
+class Line(NamedTuple):
+    """One arm on one game.
+
+    Attributes:
+        label: in the legend; the same arm has the same one in all panels.
+        steps: env steps [N].
+        mean: [N] over seeds.
+        low, high: [N], limits of its interval; NaN where there is none.
+        seeds: how many.
+        thesis: (env steps, returns) of the thesis' own curve, or None.
+    """
+
+    label: str
+    steps: Sequence[float]
+    mean: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+    seeds: int
+    thesis: tuple | None = None
+
+
+class Level(NamedTuple):
+    """A published result: a horizontal line.
+
+    Attributes:
+        method: whose, at the line.
+        score: where it is.
+        differs: what differs from the runs that are drawn, below the figure; may be empty.
+    """
+
+    method: str
+    score: float
+    differs: str = ""
+
+
+class Panel(NamedTuple):
+    """One game."""
+
+    title: str
+    lines: Sequence[Line]
+    levels: Sequence[Level] = ()
+
+
+def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, note: str = "") -> Path:
+    """Draws a panel a game; bands are intervals over seeds.
+
+    The thesis' curves are dashed, in their arm's colour, and end where the panel's longest line does.
+
+    Args:
+        panels: at least one, with at least one line.
+        path: of the PNG file.
+        title: of the figure.
+        note: below it.
+    """
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    labels = list(dict.fromkeys(line.label for panel in panels for line in panel.lines))
+    colours = {label: plots.COLOURS[i % len(plots.COLOURS)] for i, label in enumerate(labels)}
+    width = 4.6 if columns > 1 else 6.4
+    figure = plots._figure(width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)
+    handles: dict[str, object] = {}
+    for i, panel in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, i + 1, xlabel=plots.STEPS_LABEL, ylabel="mean return")
+        axes.set_title(panel.title, fontsize=10, parse_math=False)
+        end = max((max(line.steps) for line in panel.lines if len(line.steps)), default=1)
+        for line in panel.lines:
+            if not len(line.steps):
+                continue
+            colour = colours[line.label]
+            axes.fill_between(line.steps, line.low, line.high, color=colour, alpha=0.18, linewidth=0)
+            (handle,) = axes.plot(line.steps, line.mean, color=colour, linewidth=1.8)
+            handles.setdefault(f"{line.label} ({_seeds(panels, line.label)})", handle)
+            if line.thesis is not None:
+                steps, returns = (np.asarray(x, float) for x in line.thesis)
+                at = np.unique(np.minimum(steps, end))
+                (dashed,) = axes.plot(
+                    at, np.interp(at, steps, returns), "--", color=colour, linewidth=1.2, alpha=0.8
+                )
+                handles["the thesis' own, one run each"] = dashed
+        _levels(axes, panel.levels, end)
+        plots._count_axis(axes)
+        axes.set_xlim(0, end)
+    known = "the thesis' own, one run each"
+    if known in handles:  # last, and in no arm's colour
+        from matplotlib.lines import Line2D
+
+        del handles[known]
+        handles[known] = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
+    notes = [note] if note else []
+    for panel in panels:
+        notes += [f"{panel.title}, {x.method}, {x.score:g}: {x.differs}" for x in panel.levels if x.differs]
+    characters = int(17 * width * columns)
+    notes = [line for text in notes for line in textwrap.wrap(text, characters, subsequent_indent="    ")]
+    legend = figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=1 if columns == 1 else 2,
+        fontsize=8,
+        title="\n".join(notes),
+        title_fontsize=7,
+        alignment="left",
+        frameon=False,
+    )
+    legend.get_title().set_parse_math(False)
+    figure.suptitle(title, fontsize=11).set_parse_math(False)
+    return plots._save(figure, path)
+
+
+def _seeds(panels: Sequence[Panel], label: str) -> str:
+    counts = sorted({line.seeds for panel in panels for line in panel.lines if line.label == label})
+    number = " or ".join(map(str, counts))
+    return f"{number} seed{'' if counts == [1] else 's'}"
+
+
+def _levels(axes, levels: Sequence[Level], end: float) -> None:
+    """Dotted lines, their names side by side along them, so that near ones can be told apart."""
+    for i, level in enumerate(levels):
+        axes.axhline(level.score, color="#888888", linestyle=":", linewidth=1)
+        text = axes.annotate(
+            level.method,
+            (end * (0.01 + i / len(levels)), level.score),
+            xytext=(0, 1.5),
+            textcoords="offset points",
+            fontsize=6.5,
+            color="#555555",
+            parse_math=False,
+        )
+        text.set_in_layout(False)

@@ -1,0 +1,301 @@
+"""Draws a figure of the thesis, from runs that it starts where they are missing.
+
+    python -m experiments.figures --figure=6.3 --games=Pong,Breakout --seeds=3 --steps=500000
+
+Every arm of the figure that has not been run yet is run, each seed as a process of its own that can be killed
+and gone on with; then the figure is drawn: mean evaluation return over seeds with 95 % intervals of the
+stratified bootstrap, against env steps, over the thesis' own curve where there is one. FIGURE.png and
+FIGURE.json (its numbers) go to OUT/figures. Runs lie in OUT/GAME/ARM/seedN and are shared by all figures.
+Every flag of experiments.train that says something of a run goes to all of them.
+"""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from absl import flags
+
+from experiments import collect, curves, plots, sweep
+from experiments import flags as config_flags
+from experiments.arms import FIGURES, Figure, figures_named
+from experiments.collect import RunData, steps_and_returns
+from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
+from srl_jax import statistics
+from srl_jax.config import Config
+from srl_jax.data import published
+from srl_jax.envs import ATARI_57
+from srl_jax.errors import ConfigError, SaveError
+from srl_jax.specs import choices_text
+
+FLAGS = flags.FLAGS
+
+BOOTSTRAP = {"repetitions": 10_000, "seed": 0}
+
+
+def planned(
+    figures: Sequence[Figure], games: Sequence[str], seeds: Sequence[int], given: dict
+) -> list[Planned]:
+    """The runs that figures need, each once.
+
+    Args:
+        figures: whose arms are run.
+        games: each arm is run on all of them.
+        seeds: and with all of these.
+        given: flags for all runs.
+    """
+    runs: dict[str, Planned] = {}
+    for seed in seeds:  # one of everything, then the next: what is there of a sweep can be compared
+        for figure in figures:
+            for game in games:
+                arms = [Arm(arm.name, arm.preset_for(game), dict(arm.flags)) for arm in figure.arms]
+                for run in plan(arms, [game], [seed], given):
+                    if runs.setdefault(run.name, run) != run:
+                        raise ConfigError(f"--figure: two figures mean different runs by {run.name}")
+    return list(runs.values())
+
+
+def evaluated(
+    figure: Figure,
+    runs: Sequence[RunData],
+    games: Sequence[str],
+    *,
+    methods: Sequence[str] = (),
+    force: bool = False,
+) -> dict[str, Any]:
+    """The numbers of a figure, as JSON values; what has no interval (a single seed) has None there.
+
+    Args:
+        figure: its first arm is the baseline.
+        runs: on disk; those of other arms and games are left out.
+        games: in this order.
+        methods: whose published scores are given, with what differs.
+        force: compare runs of different protocols, and say what differs.
+
+    Raises:
+        ConfigError: runs cannot be compared.
+    """
+    names = [arm.name for arm in figure.arms]
+    runs = [run for run in runs if run.arm in names and run.game in games and len(steps_and_returns(run)[0])]
+    collect.check_arms(runs)
+    forced = collect.check_protocols(runs, force=force)
+    groups = collect.grouped(runs)
+    result: dict[str, Any] = {
+        "figure": figure.name,
+        "title": figure.title,
+        "question": figure.question,
+        "baseline": names[0],
+        "arms": names,
+        "level": 0.95,
+        "forced": forced,
+        "games": {},
+    }
+    areas: dict[str, dict[str, np.ndarray]] = {}
+    for game in games:
+        members = groups.get(game, {})
+        members = {name: members[name] for name in names if name in members}
+        if not members:
+            continue
+        found = {name: [steps_and_returns(run) for run in arm] for name, arm in members.items()}
+        until = min(int(steps[-1]) for arm in found.values() for steps, _ in arm)
+        entry: dict[str, Any] = {"equal_until": until, "arms": {}}
+        at_end: dict[str, np.ndarray] = {}
+        for name, arm in found.items():
+            grid, returns = statistics.at_equal_steps(arm)
+            interval = statistics.curve_interval(returns, **BOOTSTRAP)
+            area = statistics.area_under_curve(grid, returns, until)
+            areas.setdefault(game, {})[name] = area
+            at_end[name] = np.array([np.interp(until, grid, one) for one in returns])
+            entry["arms"][name] = {
+                "seeds": [run.seed for run in members[name]],
+                "env_steps": grid.tolist(),
+                **_limits(interval),
+                "runs": _plain(returns),
+                "area_under_curve": _limits(statistics.bootstrap(statistics.mean, {game: area}, **BOOTSTRAP)),
+                "at_the_end": _limits(
+                    statistics.bootstrap(statistics.mean, {game: at_end[name]}, **BOOTSTRAP)
+                ),
+            }
+        for name in list(entry["arms"])[1:] if names[0] in entry["arms"] else []:
+            ours, base = {game: areas[game][name]}, {game: areas[game][names[0]]}
+            entry["arms"][name]["against_baseline"] = {
+                "area_under_curve": _limits(statistics.bootstrap_difference(ours, base, **BOOTSTRAP)),
+                "at_the_end": _limits(
+                    statistics.bootstrap_difference(
+                        {game: at_end[name]}, {game: at_end[names[0]]}, **BOOTSTRAP
+                    )
+                ),
+                "probability_of_improvement": _limits(
+                    statistics.bootstrap(statistics.probability_of_improvement, ours, base, **BOOTSTRAP)
+                ),
+            }
+        config = next(iter(members.values()))[0].config
+        entry["published"] = [level._asdict() for level in published_levels(game, methods, config, until)]
+        result["games"][game] = entry
+    return result
+
+
+def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[curves.Level]:
+    """Published scores as lines that say what differs from these runs.
+
+    Args:
+        game: of the runs.
+        methods: names in srl_jax/data/published.csv, Random, or Human; one without a score here is left out.
+        config: of one of the runs.
+        until: env steps; of several scores of a method, the one that is nearest counts.
+    """
+    levels = []
+    for method in methods:
+        found = [entry for entry in published(game) if entry.method == method]
+        if found:
+            entry = min(found, key=lambda entry: abs((entry.env_steps or 0) - until))
+            levels.append(curves.Level(method, entry.score, entry.differs_from(config, until)))
+    return levels
+
+
+def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
+    """Draws what `evaluated` gave.
+
+    Args:
+        figure: for the thesis' curves.
+        numbers: at least one game.
+        path: of the PNG file.
+    """
+    panels = []
+    for game, entry in numbers["games"].items():
+        lines = []
+        for arm in figure.arms:
+            if (values := entry["arms"].get(arm.name)) is not None:
+                limits = (np.array(values[key], float) for key in ("mean", "low", "high"))
+                seeds, thesis = len(values["seeds"]), arm.thesis_curve(game)
+                lines.append(curves.Line(arm.name, values["env_steps"], *limits, seeds, thesis))
+        panels.append(curves.Panel(game, lines, [curves.Level(**level) for level in entry["published"]]))
+    note = "bands: 95 % stratified bootstrap over seeds"
+    if numbers["forced"]:
+        note += "; PROTOCOLS DIFFER between runs"
+    return curves.comparison(panels, path, f"{figure.name}  {figure.title}", note)
+
+
+def _limits(interval: statistics.Interval) -> dict[str, Any]:
+    return {
+        name: _plain(getattr(interval, key))
+        for name, key in (("mean", "point"), ("low", "low"), ("high", "high"))
+    }
+
+
+def _plain(values: Any) -> Any:
+    """Floats or nested lists of floats; None for what is not a number."""
+    array = np.asarray(values, float)
+    if array.ndim:
+        return [_plain(element) for element in array]
+    return float(array) if np.isfinite(array) else None
+
+
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines this entry point's flags."""
+    config_flags.define_config_flags(values)
+    config_flags.define_runtime_flag(values)
+    flags.DEFINE_string(
+        "figure",
+        None,
+        f"all; {', '.join(FIGURES)}, several with commas; or a JSON file, see experiments/arms.py",
+        flag_values=values,
+    )
+    flags.DEFINE_list("games", ["Pong"], "to run each arm on; a panel each", flag_values=values)
+    flags.DEFINE_string("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,", flag_values=values)
+    flags.DEFINE_string("out", "runs/figures", "directory of runs and figures", flag_values=values)
+    sweep.define_launcher_flags(values)
+    flags.DEFINE_string(
+        "published",
+        "Random,Human,Dopamine Rainbow",
+        "published results to draw as lines where a game has them, names with commas, as in "
+        "srl_jax/data/published.csv",
+        flag_values=values,
+    )
+    flags.DEFINE_boolean("redraw", False, "draw from the runs that are there; start none", flag_values=values)
+    flags.DEFINE_boolean(
+        "force", False, "compare runs of different protocols, and say so in the figure", flag_values=values
+    )
+
+
+def run(values: flags.FlagValues) -> int:
+    """Runs what is missing of the figures that the command line asks for, and draws them.
+
+    Args:
+        values: parsed flags, as `define_flags` defines them.
+
+    Returns:
+        The exit status, the sweep's.
+
+    Raises:
+        ConfigError: the command line is not valid, and nothing was written; or runs cannot be compared.
+        SaveError: a file cannot be written.
+    """
+    if not values["figure"].value:
+        raise ConfigError(f"--figure: missing; one of all, {', '.join(FIGURES)}, or a JSON file")
+    figures = figures_named(values["figure"].value)
+    out = values["out"].value
+    root = config_flags.check_place("out", out)
+    options = sweep.launcher_options(values)
+    seeds, games = parse_seeds(values["seeds"].value), list(dict.fromkeys(values["games"].value))
+    runs = planned(figures, games, seeds, sweep.given_flags(values))
+    methods = _known(values["published"].value)
+    if values["dry_run"].value:
+        print("\n".join(sweep.dry_run(root, runs, **options)))
+        return 0
+    if not plots.available():
+        raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
+    status = 0
+    try:
+        if not values["redraw"].value:
+            status = sweep.run_sweep(root, runs, **options).status
+        here = [root / run.name for run in runs if (root / run.name / "config.json").exists()]
+        read = [collect.load_run(path) for path in here]
+        for figure in figures:
+            how = {"methods": methods, "force": values["force"].value}
+            print(write(figure, read, games, root / "figures", **how))
+    except OSError as error:
+        raise SaveError(f"--out={out}: {error.strerror or error}") from error
+    return status
+
+
+def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directory: Path, **how: Any) -> Path:
+    """Writes a figure's numbers and its picture.
+
+    Args:
+        figure: see `evaluated`, as for runs, games and what else there is.
+        directory: for NAME.json and NAME.png, which are replaced.
+
+    Returns:
+        The path of the picture.
+
+    Raises:
+        ConfigError: none of its arms has been evaluated, or see `evaluated`.
+    """
+    numbers = evaluated(figure, runs, games, **how)
+    if not numbers["games"]:
+        raise ConfigError(f"no evaluation of any arm of figure {figure.name} in {directory.parent}")
+    directory.mkdir(exist_ok=True)
+    (directory / f"{figure.name}.json").write_text(json.dumps(numbers, indent=1) + "\n")
+    return draw(figure, numbers, directory / f"{figure.name}.png")
+
+
+def _known(text: str) -> list[str]:
+    methods = [name for name in text.split(",") if name]
+    known = dict.fromkeys(entry.method for game in ATARI_57 for entry in published(game))
+    for name in methods:
+        if name not in known:
+            raise ConfigError(f"--published={text}: {choices_text(name, known)}")
+    return methods
+
+
+def main(argv: list[str]) -> int:
+    """The entry point."""
+    del argv
+    return run(FLAGS)
+
+
+if __name__ == "__main__":
+    define_flags()
+    config_flags.run(main)

@@ -1,0 +1,89 @@
+"""The functions of the device that diagnostics need: few, and each compiled for one shape."""
+
+from collections.abc import Callable, Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from srl_jax.modes import Mode
+from srl_jax.optim import RL
+from srl_jax.types import Array, Encoder, Latents, Objective, Params, Window
+from srl_jax.update import make_conflict
+from srl_jax.window import stack_last
+
+
+class Functions(NamedTuple):
+    """Jitted.
+
+    Attributes:
+        encode: (encoder's parameters, frames uint8 [B, S, H, W]) -> float32 [B, D].
+        decode: {objective: (head, latents [B, D], Window) -> (errors [B], targets, outputs)}, of those with
+            an image that the latent of s_t is enough for. Errors are squared and averaged over the image. Of
+            targets and outputs the newest two frames, float32 [B, H, W, 2] (of observations of one frame, 1).
+        others: names of objectives with an image that need more than that.
+        conflict: `srl_jax.update.make_conflict`'s; None where RL and representation losses do not both run.
+    """
+
+    encode: Callable
+    decode: Mapping[str, Callable]
+    others: tuple[str, ...]
+    conflict: Callable | None
+
+
+class MoreLatents(Exception):
+    """An image asks for more than the latent of s_t."""
+
+
+def make_functions(
+    encoder: Encoder, objectives: Mapping[str, Objective], mode: Mode, *, augment: str, target_encoder: str
+) -> Functions:
+    """The functions of an agent; options as of `srl_jax.update.make_update`."""
+    images = {name: objective.image for name, objective in objectives.items() if objective.image}
+    decode = {name: _decode(image) for name, image in images.items()}
+    ready = {n: f for n, f in decode.items() if _enough(f, objectives[n], encoder)}
+    conflict = None
+    if mode.rl and mode.representation and len(objectives) > 1 and RL in objectives:
+        conflict = jax.jit(
+            make_conflict(encoder, objectives, mode, augment=augment, target_encoder=target_encoder)
+        )
+    return Functions(
+        encode=jax.jit(lambda params, frames: encoder.apply(params, stack_last(frames))),
+        decode={name: jax.jit(function) for name, function in ready.items()},
+        others=tuple(images.keys() - ready.keys()),
+        conflict=conflict,
+    )
+
+
+def _decode(image: Callable) -> Callable:
+    def decode(head: Params, z: Array, window: Window):
+        def known(k):
+            if isinstance(k, int) and k == 0:
+                return z
+            raise MoreLatents
+
+        target, output = image(head, Latents(known, known), window)
+        errors = jnp.mean((output - target) ** 2, (1, 2, 3))
+        return errors, target[..., -2:], output[..., -2:]
+
+    return decode
+
+
+def _enough(decode: Callable, objective: Objective, encoder: Encoder) -> bool:
+    """Whether an image can be made of the latent of s_t; compiles nothing."""
+    height, width, stack = encoder.observation_shape
+    steps = max(1, objective.horizon)
+
+    def shape(dtype, *of):
+        return jax.ShapeDtypeStruct((2, *of), dtype)
+
+    numbers = [shape(jnp.float32, steps)] * 3
+    window = Window(
+        shape(jnp.uint8, stack + steps, height, width), shape(jnp.int32, steps), *numbers, shape(jnp.float32)
+    )
+    head = jax.eval_shape(objective.init, jax.random.key(0))
+    try:
+        jax.eval_shape(decode, head, shape(jnp.float32, encoder.features), window)
+    except MoreLatents:
+        return False
+    return True

@@ -1,0 +1,208 @@
+"""The observations that every run of a game is measured on: the same for all arms and seeds."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from srl_jax import envs
+from srl_jax.actor import seed_for
+from srl_jax.config import Config
+from srl_jax.data import ram_labels
+from srl_jax.envs import ATARI_57
+from srl_jax.replay import Replay
+from srl_jax.types import Window
+
+SEED = 0
+"""Of the held-out observations: not the run's."""
+WINDOWS = 512
+ENVS = 4
+STRIDE = 4
+"""Env steps between two observations that are kept, on average: neighbours look alike."""
+LONGEST = 100
+"""Env steps after which an episode is left for another one: a probe is fitted on some, scored on others."""
+
+
+class HeldOut(NamedTuple):
+    """N windows in an order of no meaning, and what is known of them.
+
+    Attributes:
+        windows: N of them, of uniform weight.
+        states: float64 [N, V], of s_t.
+        variables: the V names; none where the game's state is not known.
+        episodes: int64 [N], which one a window is of.
+        problem: why the state is not known although it should be; empty where all is well.
+    """
+
+    windows: Window
+    states: np.ndarray
+    variables: tuple[str, ...]
+    episodes: np.ndarray
+    problem: str
+
+    @property
+    def observations(self) -> np.ndarray:
+        """s_t: uint8 [N, S, H, W]."""
+        frames, horizon = self.windows.frames, self.windows.actions.shape[1]
+        return frames[:, : frames.shape[1] - horizon]
+
+
+def collect(config: Config, horizon: int) -> HeldOut:
+    """Plays a random policy in environments of their own, and keeps some of what it saw.
+
+    Which observations these are depends on the game and its protocol (sticky actions, no-ops, size and number
+    of frames), and on nothing else.
+
+    Args:
+        config: a run's.
+        horizon: steps in a window, K.
+    """
+    steps = WINDOWS * STRIDE // ENVS
+    env = envs.make(
+        config.game,
+        num_envs=ENVS,
+        seed=seed_for(SEED, "held out", "environments"),
+        frame_size=config.frame_size,
+        sticky_actions=config.sticky_actions,
+        noop_max=config.noop_max,
+    )
+    rng = np.random.default_rng(seed_for(SEED, "held out", "policy"))
+    # In each environment one of every STRIDE steps, but none in the last ones.
+    wanted = np.arange(0, steps, STRIDE) + rng.integers(0, STRIDE, (ENVS, steps // STRIDE))
+    actions = rng.integers(0, env.single_action_space.n, (steps + STRIDE, ENVS), dtype=np.int32)
+    order = rng.permutation(WINDOWS)
+
+    replay = Replay(
+        # As many slots as observations: every episode has one more of them than it has steps.
+        capacity=ENVS * (2 * len(actions) + config.frame_stack + horizon),
+        num_streams=ENVS,
+        frame_shape=env.single_observation_space.shape,
+        stack=config.frame_stack,
+        horizon=horizon,
+        gamma=config.gamma,
+        alpha=0.0,
+    )
+    reader = _reader(config, env)
+    everyone = np.arange(ENVS)
+    episodes, next_episode = np.arange(ENVS), ENVS
+    length = np.zeros(ENVS, int)
+    due = np.zeros(ENVS, int)  # the index in `wanted` of the next one of each environment
+    rows: list[tuple[int, np.ndarray, int]] = []
+    frames, info = env.reset()
+    replay.begin(frames)
+    reader.begin(np.ones(ENVS, bool), frames, info)
+    for step, action in enumerate(actions):
+        # An observation that is followed by a step of its episode: it always is, here.
+        take = [i for i in everyone if due[i] < wanted.shape[1] and step >= wanted[i, due[i]]]
+        for i in take:
+            index = (replay.next_position[i] - 1) * ENVS + i
+            rows.append((int(index), reader.state(i), int(episodes[i])))
+            due[i] += 1
+        frames, rewards, terminated, truncated, info = env.step(action)
+        length += 1
+        truncated |= (length >= LONGEST) & ~terminated
+        replay.add(action, np.sign(rewards), terminated, truncated, info["life_lost"], frames)
+        over = terminated | truncated
+        looked_at = [i for i in everyone if due[i] < wanted.shape[1] and step + 1 >= wanted[i, due[i]]]
+        reader.step(action, over, looked_at, frames, info)
+        if over.any():
+            frames, info = env.reset(options={"reset_mask": over})
+            replay.begin(frames[over], np.flatnonzero(over))
+            reader.begin(over, frames, info)
+            episodes[over] = next_episode + np.arange(over.sum())
+            next_episode += int(over.sum())
+            length[over] = 0
+    env.close()
+    indices, states, of_episode = zip(*[rows[i] for i in order], strict=True)
+    return HeldOut(
+        replay.gather(np.array(indices)),
+        np.array(states, np.float64).reshape(WINDOWS, -1)[:, : len(reader.variables)],
+        reader.variables,
+        np.array(of_episode),
+        reader.problem,
+    )
+
+
+class _Unknown:
+    """The state of a game that nobody has labelled.
+
+    Attributes:
+        variables: names of the numbers that `state` gives.
+        problem: what kept it from going on, or "".
+    """
+
+    variables: tuple[str, ...] = ()
+    problem = ""
+
+    def begin(self, mask: np.ndarray, frames: np.ndarray, info: dict) -> None:
+        """Episodes of the mask, bool [N], have begun."""
+
+    def step(self, actions: np.ndarray, over: np.ndarray, looked_at: list[int], frames, info: dict) -> None:
+        """All environments have moved; `looked_at` are those whose state may be asked for now."""
+
+    def state(self, env: int) -> np.ndarray:
+        """Of one environment, now: float64 [V]."""
+        return np.zeros(0)
+
+
+class _Told(_Unknown):
+    """The state is in `info`."""
+
+    def __init__(self, env):
+        self.variables = env.state_names
+
+    def begin(self, mask, frames, info):
+        self._states = info["state"]
+
+    def step(self, actions, over, looked_at, frames, info):
+        self._states = info["state"]
+
+    def state(self, env):
+        return self._states[env].astype(np.float64)
+
+
+class _Memory(_Unknown):
+    """The labelled bytes of the memory of emulators that are in step with the environments."""
+
+    def __init__(self, env, config: Config, labels: dict[str, int]):
+        from srl_jax.envs.ram import OutOfStep, Twin
+
+        self.variables, self._bytes = tuple(labels), list(labels.values())
+        self._env, self._out_of_step = env, OutOfStep
+        self._twins = [
+            Twin(config.game, sticky_actions=config.sticky_actions, noop_max=config.noop_max)
+            for _ in range(env.num_envs)
+        ]
+
+    def begin(self, mask, frames, info):
+        if self.problem:
+            return
+        for i in np.flatnonzero(mask):
+            seeded = self._env.steps_since_seeded[i] == 0
+            self._twins[i].reset(int(self._env.ale_seeds[i]) if seeded else None)
+            self._check(i, frames, info)
+
+    def step(self, actions, over, looked_at, frames, info):
+        if self.problem:
+            return
+        for i, twin in enumerate(self._twins):
+            twin.step(int(actions[i]), i in looked_at)
+        for i in looked_at:
+            if not over[i]:  # a game's last frame is older than its screen
+                self._check(i, frames, info)
+
+    def state(self, env):
+        return self._twins[env].ram()[self._bytes].astype(np.float64)
+
+    def _check(self, i, frames, info):
+        try:
+            self._twins[i].check(frames[i], int(info["frame_number"][i]), int(info["lives"][i]))
+        except self._out_of_step as error:
+            self.problem = f"the emulator whose memory is read is out of step: {error}"
+            self.variables = ()
+
+
+def _reader(config: Config, env) -> _Unknown:
+    if config.game not in ATARI_57:
+        return _Told(env)
+    labels = ram_labels(config.game)
+    return _Memory(env, config, labels) if labels else _Unknown()

@@ -1,0 +1,148 @@
+"""Intervals: the percentile interval of the stratified bootstrap, which draws runs again within each game."""
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from srl_jax.statistics.aggregates import Scores, Statistic, by_game, check_games, mean
+
+_BLOCK = 1 << 22
+"""Scores that are drawn again at once, 32 MiB of them."""
+
+
+class Interval(NamedTuple):
+    """An estimate and its interval.
+
+    Attributes:
+        point: float64, the statistic of the scores themselves.
+        low: float64 of the same shape, the interval's lower limit; NaN where some game has a single run.
+        high: float64 of the same shape, the upper limit, likewise.
+    """
+
+    point: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def bootstrap(
+    statistic: Statistic, *arms: Scores, repetitions: int = 2_000, level: float = 0.95, seed: int = 0
+) -> Interval:
+    """A statistic of one or several arms and its percentile interval.
+
+    The order of runs does not matter: they are sorted first.
+
+    Args:
+        statistic: takes a mapping from a game to scores [..., runs] for each arm; gives [..., *shape].
+        *arms: scores [runs, games], or game -> [runs]; each arm is drawn again independently.
+        repetitions: how many times.
+        level: of the interval.
+        seed: of the draws.
+
+    Returns:
+        An Interval of arrays [*shape].
+
+    Raises:
+        ValueError: level or repetitions are out of range, or what `mean` raises.
+    """
+    given = [by_game(arm) for arm in arms]
+    if any(x.ndim != 1 for arm in given for x in arm.values()):
+        raise ValueError("bootstrap takes scores [runs, games], or game -> [runs]")
+    given = [{game: np.sort(x) for game, x in arm.items()} for arm in given]
+    rng = np.random.default_rng(seed)
+    drawn = [
+        {game: x[draw] for (game, x), draw in zip(arm.items(), _draw(arm, repetitions, rng), strict=True)}
+        for arm in given
+    ]
+    low, high = percentile_interval(statistic(*drawn), level)
+    return _interval(statistic(*given), low, high, *given)
+
+
+def bootstrap_difference(x: Scores, y: Scores, statistic: Statistic = mean, **how: Any) -> Interval:
+    """The statistic of x minus that of y; the arms are drawn again independently.
+
+    Args:
+        x: scores of one arm.
+        y: scores of the other one; the games must be the same.
+        statistic: of one arm.
+        **how: see `bootstrap`.
+    """
+    check_games(by_game(x), by_game(y))
+    return bootstrap(difference(statistic), x, y, **how)
+
+
+def percentile_interval(values: np.ndarray, level: float = 0.95) -> tuple[np.ndarray, np.ndarray]:
+    """The limits between which the middle of the values [repetitions, ...] lies, linearly interpolated.
+
+    Args:
+        values: a statistic of each repetition.
+        level: the share of them in the middle.
+
+    Returns:
+        low and high, float64 [...].
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level={level}: must be between 0 and 1")
+    tail = (1 - level) / 2
+    low, high = np.percentile(values, [100 * tail, 100 * (1 - tail)], axis=0)
+    return low, high
+
+
+def curve_interval(
+    returns: Scores,
+    statistic: Statistic = mean,
+    *,
+    repetitions: int = 2_000,
+    level: float = 0.95,
+    seed: int = 0,
+) -> Interval:
+    """A statistic of learning curves and its interval at each point; whole curves are drawn again.
+
+    Args:
+        returns: float64 [runs, points] of one game, [runs, games, points], or game -> [runs, points].
+        statistic: of one arm's scores.
+        repetitions: see `bootstrap`.
+        level: of the interval at one point; not of the whole curve.
+        seed: of the draws.
+
+    Returns:
+        An Interval of arrays [points].
+    """
+    if not isinstance(returns, Mapping):
+        returns = np.asarray(returns, np.float64)
+        if returns.ndim not in (2, 3):
+            raise ValueError("curves are [runs, points], [runs, games, points], or game -> [runs, points]")
+        games = returns[:, None] if returns.ndim == 2 else returns
+        returns = {str(i): games[:, i] for i in range(games.shape[1])}
+    curves = {game: np.asarray(x, np.float64) for game, x in returns.items()}
+    if any(x.ndim != 2 for x in curves.values()) or len({x.shape[1] for x in curves.values()}) != 1:
+        raise ValueError("curves of all games and runs must have the same points; see at_equal_steps")
+    games = by_game({game: x.T for game, x in curves.items()})
+    draws = _draw(games, repetitions, np.random.default_rng(seed))
+    block = max(1, _BLOCK // (repetitions * sum(x.shape[-1] for x in games.values())))
+    points = next(iter(games.values())).shape[0]
+    limits = []
+    for start in range(0, points, block):
+        again = (x[start : start + block, draw] for x, draw in zip(games.values(), draws, strict=True))
+        values = statistic(dict(zip(games, again, strict=True)))
+        limits.append(percentile_interval(np.moveaxis(values, 1, 0), level))
+    low, high = (np.concatenate(limit) for limit in zip(*limits, strict=True))
+    return _interval(statistic(games), low, high, games)
+
+
+def difference(statistic: Statistic) -> Statistic:
+    """(x, y) -> the statistic of x minus that of y."""
+    return lambda x, y: statistic(x) - statistic(y)
+
+
+def _draw(games: Mapping[str, np.ndarray], repetitions: int, rng: np.random.Generator) -> list[np.ndarray]:
+    """Indices of runs for each game, [repetitions, runs]."""
+    if repetitions < 1:
+        raise ValueError(f"repetitions={repetitions}: must be at least 1")
+    return [rng.integers(x.shape[-1], size=(repetitions, x.shape[-1])) for x in games.values()]
+
+
+def _interval(point, low, high, *arms: Mapping[str, np.ndarray]) -> Interval:
+    if any(x.shape[-1] < 2 for arm in arms for x in arm.values()):
+        low, high = np.full_like(low, np.nan), np.full_like(high, np.nan)
+    return Interval(*(np.asarray(x, np.float64) for x in (point, low, high)))

@@ -1,0 +1,89 @@
+"""The table of several arms that figures and reports show."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from srl_jax.statistics.aggregates import (
+    AGGREGATES,
+    Scores,
+    Statistic,
+    by_game,
+    human_normalised,
+    mean,
+    probability_of_improvement,
+)
+from srl_jax.statistics.intervals import Interval, bootstrap, difference
+
+
+def runs_text(scores: Scores) -> str:
+    """How many runs: "5 runs", "5 runs of each of 2 games" or "Pong 5 runs, Qbert 3 runs"."""
+    numbers = {game: x.shape[-1] for game, x in by_game(scores).items()}
+    texts = {game: f"{number} run{'' if number == 1 else 's'}" for game, number in numbers.items()}
+    if len(set(numbers.values())) > 1:
+        return ", ".join(f"{game} {text}" for game, text in texts.items())
+    text = next(iter(texts.values()))
+    return f"{text} of each of {len(numbers)} games" if len(numbers) > 1 else text
+
+
+def summary(
+    arms: Mapping[str, Mapping[str, Any]], *, baseline: str | None = None, seed: int = 0, **how: Any
+) -> list[dict[str, Any]]:
+    """A table of every arm: each number with its interval and the runs behind it; values are JSON's.
+
+    Args:
+        arms: arm -> game -> raw scores [runs].
+        baseline: the arm that all others are compared with; None for none.
+        seed: of the draws; every row starts from it.
+        **how: repetitions and level, see `bootstrap`.
+
+    Returns:
+        Rows with the keys arm, against (the baseline, or None), game (None: over all games that every arm
+        has), statistic, point, low, high (None: no interval, from a single run), runs (their number in
+        words). Statistics: "return" of each game, unnormalised; `AGGREGATES` of human-normalised scores;
+        against the baseline "return_difference" of each game, "mean_difference" and so on, the arm's minus
+        the baseline's, and "probability_of_improvement". There is no row for what the arms do not share.
+
+    Raises:
+        ValueError: the baseline is no arm, a game is not known, or what `mean` raises.
+    """
+    if baseline is not None and baseline not in arms:
+        raise ValueError(f"baseline {baseline} is not one of the arms: {', '.join(arms)}")
+    games = [
+        game for game in next(iter(arms.values()), {}) if all(game in scores for scores in arms.values())
+    ]
+    normal = {a: {g: human_normalised(g, scores[g]) for g in games} for a, scores in arms.items()}
+    rows = []
+
+    def add(name: str, statistic: Statistic, of: str, game: str | None, *scores: Scores) -> None:
+        found = bootstrap(statistic, *scores, seed=seed, **how)
+        numbers = [None if np.isnan(value) else float(value) for value in found]
+        runs = " against ".join(dict.fromkeys(runs_text(arm) for arm in scores))
+        against = baseline if len(scores) > 1 else None
+        row = {"arm": of, "against": against, "game": game, "statistic": name}
+        rows.append(row | dict(zip(Interval._fields, numbers, strict=True)) | {"runs": runs})
+
+    for arm, scores in arms.items():
+        theirs = {} if arm == baseline or baseline is None else arms[baseline]
+        for game, returns in scores.items():
+            add("return", mean, arm, game, {game: returns})
+            if game in theirs:
+                pair = {game: returns}, {game: theirs[game]}
+                add("return_difference", difference(mean), arm, game, *pair)
+        if not games:
+            continue
+        for name, statistic in AGGREGATES.items():
+            add(name, statistic, arm, None, normal[arm])
+        if theirs:
+            for name, statistic in AGGREGATES.items():
+                add(f"{name}_difference", difference(statistic), arm, None, normal[arm], normal[baseline])
+            add(
+                "probability_of_improvement",
+                probability_of_improvement,
+                arm,
+                None,
+                normal[arm],
+                normal[baseline],
+            )
+    return rows

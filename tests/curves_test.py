@@ -1,0 +1,61 @@
+"""Tests of experiments.curves."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("matplotlib")
+
+from experiments import curves, plots  # noqa: E402
+
+STEPS = [0, 100, 200]
+
+
+def _panel(game, **lines):
+    made = [
+        curves.Line(name, STEPS, np.full(3, x), np.full(3, x - 1), np.full(3, x + 1), 5, thesis=thesis)
+        for name, (x, thesis) in lines.items()
+    ]
+    return curves.Panel(game, made, [curves.Level("Human", 9.0, "other protocol")])
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The figures that would have been saved."""
+    figures = []
+    monkeypatch.setattr(plots, "_save", lambda figure, path: figures.append(figure) or path)
+    return figures
+
+
+def test_every_game_has_a_panel_and_an_arm_one_colour(drawn, tmp_path):
+    thesis = ([0, 150, 300], [1.0, 4.0, 10.0])
+    panels = [_panel("Pong", a=(1.0, None), b=(2.0, thesis)), _panel("Qbert", b=(5.0, None))]
+    curves.comparison(panels, tmp_path / "x.png", "title")
+    first, second = drawn[0].axes
+    assert [axes.get_title() for axes in (first, second)] == ["Pong", "Qbert"]
+    solid = {line.get_ydata()[0]: line.get_color() for line in first.lines if line.get_linestyle() == "-"}
+    assert solid[1.0] != solid[2.0]
+    assert [line.get_color() for line in second.lines if line.get_linestyle() == "-"] == [solid[2.0]]
+    # The thesis' curve ends with ours, at 200, between its points: 4 + (10 - 4) / 3 = 6.
+    (dashed,) = [line for line in first.lines if line.get_linestyle() == "--"]
+    assert dashed.get_xdata().tolist() == [0, 150, 200]
+    assert dashed.get_ydata().tolist() == [1.0, 4.0, 6.0]
+    assert dashed.get_color() == solid[2.0]
+    (legend,) = drawn[0].legends
+    told = [text.get_text() for text in legend.get_texts()]
+    assert told == ["a (5 seeds)", "b (5 seeds)", "the thesis' own, one run each"]
+    assert [text.get_text() for text in first.texts] == ["Human"]
+    assert "Pong, Human, 9: other protocol" in legend.get_title().get_text()
+
+
+def test_a_band_is_the_interval(drawn, tmp_path):
+    curves.comparison([_panel("Pong", a=(3.0, None))], tmp_path / "x.png", "title")
+    (band,) = drawn[0].axes[0].collections
+    corners = band.get_paths()[0].vertices
+    assert (corners[:, 1].min(), corners[:, 1].max()) == (2.0, 4.0)
+    assert (corners[:, 0].min(), corners[:, 0].max()) == (0, 200)
+
+
+def test_the_same_numbers_give_the_same_file(tmp_path):
+    panels = [_panel("Pong", a=(1.0, None))]
+    files = [curves.comparison(panels, tmp_path / name, "title", "note") for name in ("x.png", "y.png")]
+    assert files[0].read_bytes() == files[1].read_bytes()

@@ -1,0 +1,169 @@
+"""Tests of experiments.figures."""
+
+import json
+
+import numpy as np
+import pytest
+from absl import flags
+
+from experiments import collect, figures
+from experiments import flags as config_flags
+from experiments.arms import FIGURES, Figure, FigureArm
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
+from tests.helpers import write_run
+
+FIGURE = Figure("mine", "Mine", "?", (FigureArm("a", "catch/rl_only"), FigureArm("b", "catch/joint")))
+
+
+@pytest.fixture
+def runs(tmp_path):
+    """Two seeds of a, to 200 env steps, and three of b, one of which ends at 200."""
+    for seed, returns in enumerate([(-1, 0, 1), (-1, -1, 0)]):
+        write_run(tmp_path / f"Catch/a/seed{seed}", returns, seed=seed)
+    for seed, returns in enumerate([(0, 1, 1, 5), (0, 0, 1), (0, 2, 1, 5)]):
+        write_run(tmp_path / f"Catch/b/seed{seed}", returns, seed=seed, mode="joint")
+    write_run(tmp_path / "Catch/other/seed0", (9, 9, 9))
+    return tmp_path
+
+
+def _evaluated(root, games=("Catch",), **how):
+    return figures.evaluated(FIGURE, collect.load_runs(root), games, **how)
+
+
+def test_numbers_by_hand(runs):
+    numbers = _evaluated(runs)
+    assert numbers["arms"] == ["a", "b"] and numbers["forced"] == []
+    catch = numbers["games"]["Catch"]
+    assert catch["equal_until"] == 200 and list(catch["arms"]) == ["a", "b"]
+    a, b = catch["arms"].values()
+    assert a["seeds"] == [0, 1] and b["seeds"] == [0, 1, 2]
+    # No further than the shortest seed of the arm.
+    assert b["env_steps"] == [0, 100, 200] and b["mean"] == [0.0, 1.0, 1.0]
+    assert a["mean"] == [-1.0, -0.5, 0.5] and a["runs"] == [[-1, 0, 1], [-1, -1, 0]]
+    # Of two seeds one is drawn twice in half of all repetitions: the interval reaches from one to the other.
+    assert a["low"] == [-1.0, -1.0, 0.0] and a["high"] == [-1.0, 0.0, 1.0]
+    # Averages over 0 .. 200: (-1 / 2 + 0 + 1 / 2) / 2 = 0, (-1 / 2 - 1 + 0) / 2 = -0.75; of b .75, .25, 1.25.
+    assert a["area_under_curve"] == {"mean": -0.375, "low": -0.75, "high": 0.0}
+    assert b["area_under_curve"]["mean"] == 0.75
+    against = b["against_baseline"]
+    assert against["area_under_curve"]["mean"] == 1.125
+    assert against["at_the_end"]["mean"] == 0.5
+    assert against["probability_of_improvement"]["mean"] == 1.0
+    assert "against_baseline" not in a
+
+
+def test_a_longer_arm_is_compared_where_the_others_are(tmp_path):
+    write_run(tmp_path / "Catch/a/seed0", (0, 2))
+    write_run(tmp_path / "Catch/b/seed0", (0, 1, 1), mode="joint")
+    catch = _evaluated(tmp_path)["games"]["Catch"]
+    assert catch["equal_until"] == 100
+    a, b = catch["arms"].values()
+    assert b["env_steps"] == [0, 100, 200]  # drawn as far as it goes
+    assert (a["at_the_end"]["mean"], b["at_the_end"]["mean"]) == (2.0, 1.0)
+    assert (a["area_under_curve"]["mean"], b["area_under_curve"]["mean"]) == (1.0, 0.5)
+    # One seed has no interval.
+    assert a["low"] == [None, None] and b["against_baseline"]["at_the_end"]["low"] is None
+
+
+def test_other_games_and_arms_without_runs_are_left_out(runs):
+    numbers = _evaluated(runs, games=("Pong", "Catch"))
+    assert list(numbers["games"]) == ["Catch"]
+    b = [run for run in collect.load_runs(runs) if run.arm == "b"]
+    alone = figures.evaluated(FIGURE, b, ["Catch"])["games"]["Catch"]["arms"]
+    assert list(alone) == ["b"] and "against_baseline" not in alone["b"]
+
+
+def test_other_protocols_are_refused_unless_forced(runs):
+    write_run(runs / "Catch/b/seed3", (0, 1, 1), seed=3, mode="joint", eval_games=3)
+    with pytest.raises(ConfigError, match="same arm"):
+        _evaluated(runs)
+    (runs / "Catch/b").rename(runs / "Catch/c")
+    write_run(runs / "Catch/b/seed3", (0, 1, 1), seed=3, mode="joint", eval_games=3)
+    with pytest.raises(ConfigError, match="another protocol.*eval_games is 10 there and 3 here"):
+        _evaluated(runs)
+    assert "eval_games" in _evaluated(runs, force=True)["forced"][0]
+
+
+def test_the_same_runs_give_the_same_bytes(runs, tmp_path):
+    pytest.importorskip("matplotlib")
+    made = []
+    for name in ("x.png", "y.png"):
+        numbers = _evaluated(runs)
+        path = figures.draw(FIGURE, numbers, tmp_path / name)
+        made.append((json.dumps(numbers), path.read_bytes()))
+    assert made[0] == made[1]
+    # What is drawn is what was written.
+    again = figures.draw(FIGURE, json.loads(made[0][0]), tmp_path / "z.png")
+    assert again.read_bytes() == made[0][1]
+
+
+def test_all_figures_share_their_runs():
+    runs = figures.planned(list(FIGURES.values()), ["Catch", "Pong"], [0, 1], {"steps": "1000"})
+    names = [run.name for run in runs]
+    assert len(names) == len(set(names))
+    # 13 arms, and two runs that make encoders, on two games with two seeds.
+    assert len(names) == 15 * 4
+    presets = {run.name: run.preset for run in runs}
+    assert presets["Catch/joint_50/seed1"] == "small/joint_50"
+    assert presets["Pong/joint_50/seed0"] == "thesis/joint_50"
+    for run in runs:
+        for source in (run.encoder_from, run.policy_from):
+            assert not source or names.index(source) < names.index(run.name)
+    steps = {run.preset.partition("/")[2]: run.flags["steps"] for run in runs}
+    assert steps["joint_50"] == "1000" and steps["pretrain_256"] == "300"
+
+
+def _run(*arguments):
+    values = flags.FlagValues()
+    figures.define_flags(values)
+    config_flags.parse(["figures", *arguments], values)
+    return figures.run(values)
+
+
+@pytest.mark.parametrize(
+    "arguments, told",
+    [
+        ([], "--figure: missing; one of all, 6.1"),
+        (["--figure=6.9"], "--figure=6.9: did you mean"),
+        (["--figure=none.json"], "--figure=none.json: No such file"),
+        (["--figure=6.3", "--games=Pnog"], "--games=Pnog: did you mean Pong"),
+        (["--figure=6.3", "--seeds=0"], "--seeds=0: give a number of seeds"),
+        (["--figure=6.3", "--seed=1"], "--seed: a sweep gives it to each run; --seeds decides it"),
+        (["--figure=6.3", "--published=Hunan"], "--published=Hunan: did you mean Human"),
+        (["--figure=6.3", "--gpus_per_run=1"], "--gpus_per_run: only --launcher=ray takes it"),
+        (["--figure=6.3", "--games=Catch", "--redraw"], "no evaluation of any arm of figure 6.3"),
+    ],
+)
+def test_bad_input_is_refused_and_nothing_written(tmp_path, arguments, told):
+    with pytest.raises(ConfigError) as error:
+        _run(*arguments, f"--out={tmp_path / 'new'}")
+    assert str(error.value).startswith(told) and "\n" not in str(error.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
+    pytest.importorskip("matplotlib")
+    (runs / "Catch/a").rename(runs / "Catch/rl_only_nature")
+    (runs / "Catch/b").rename(runs / "Catch/joint_256")
+    assert _run("--figure=6.3", "--games=Catch", "--seeds=2", "--redraw", f"--out={runs}") == 0
+    assert capsys.readouterr().out == f"{runs / 'figures' / '6.3.png'}\n"
+    catch = json.loads((runs / "figures" / "6.3.json").read_text())["games"]["Catch"]
+    assert {arm: values["seeds"] for arm, values in catch["arms"].items()} == {
+        "rl_only_nature": [0, 1],
+        "joint_256": [0, 1],
+    }
+
+
+def test_published_results_say_what_differs():
+    config = Config(game="Pong", steps=300_000)
+    human, rainbow = figures.published_levels("Pong", ["Human", "Dopamine Rainbow"], config, 260_000)
+    assert (human.method, human.score) == ("Human", 14.6)
+    # Of its scores, the one after 250,000 env steps: training scores of sticky games.
+    assert "env steps 250,000 (here 260,000)" in rainbow.differs and "sticky actions 0.25" in rainbow.differs
+    assert "training score" in rainbow.differs
+    assert figures.published_levels("Catch", ["Human"], config, 100) == []
+
+
+def test_limits_of_a_single_seed_are_no_numbers():
+    assert figures._plain([1.0, np.nan]) == [1.0, None]

@@ -1,0 +1,335 @@
+"""Statistics: hand-worked numbers, rliable as the independent reference, what must hold of any interval."""
+
+import json
+import subprocess
+import sys
+import warnings
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from srl_jax import statistics
+from srl_jax.statistics import (
+    area_under_curve,
+    at_equal_steps,
+    bootstrap,
+    bootstrap_difference,
+    curve_interval,
+    human_normalised,
+    interquartile_mean,
+    mean,
+    median,
+    optimality_gap,
+    percentile_interval,
+    performance_profile,
+    probability_of_improvement,
+    reached,
+    runs_text,
+    steps_to,
+    summary,
+)
+
+with warnings.catch_warnings():  # what other packages warn of while they are imported
+    warnings.simplefilter("ignore")
+    from rliable import library, metrics
+
+SCORES = np.random.default_rng(0).normal(0.6, 0.7, size=(6, 4))
+OTHERS = np.random.default_rng(1).normal(0.5, 0.7, size=(5, 4)).round(1)
+THRESHOLDS = np.linspace(-1, 2, 13)
+PAIRS = {
+    "mean": (mean, metrics.aggregate_mean),
+    "median": (median, metrics.aggregate_median),
+    "interquartile_mean": (interquartile_mean, metrics.aggregate_iqm),
+    "optimality_gap": (optimality_gap, metrics.aggregate_optimality_gap),
+}
+"""Each aggregate here and in rliable."""
+matrices = st.tuples(st.integers(1, 7), st.integers(1, 5)).flatmap(
+    lambda shape: st.lists(
+        st.lists(st.integers(-40, 80), min_size=shape[1], max_size=shape[1]),
+        min_size=shape[0],
+        max_size=shape[0],
+    )
+)
+
+
+def test_human_normalised_score_is_0_for_random_play_and_1_for_a_human():
+    np.testing.assert_allclose(human_normalised("Pong", [-20.7, 14.6, 21.0]), [0, 1, 41.7 / 35.3], rtol=1e-12)
+    assert human_normalised("Catch", 0.5) == human_normalised("CatchDistractor", 0.5) == 0.75
+    with pytest.raises(ValueError, match="no reference scores for game Chess"):
+        human_normalised("Chess", 0)
+
+
+def test_aggregates_of_hand_worked_scores():
+    scores = np.array([[0.0, 4.0, 1.0], [2.0, 8.0, 0.0]])  # means of games: 1, 6, 0.5
+    assert mean(scores) == 2.5
+    assert median(scores) == 1.0
+    assert interquartile_mean(scores) == (0 + 1 + 2 + 4) / 4  # 6 // 4 = 1 run is cut at either end
+    assert optimality_gap(scores) == pytest.approx((1 + 0 + 0 + 0 + 0 + 1) / 6)
+    assert optimality_gap(scores, threshold=4) == pytest.approx((4 + 0 + 3 + 2 + 0 + 4) / 6)
+
+
+@given(scores=matrices)
+def test_aggregates_are_rliables(scores):
+    scores = np.array(scores) / 40
+    for ours, theirs in PAIRS.values():
+        np.testing.assert_allclose(ours(scores), theirs(scores), rtol=1e-12, atol=1e-12)
+
+
+def test_games_with_different_numbers_of_runs_weigh_the_same():
+    ragged = {"a": [1.0, 2.0], "b": [3.0, 5.0, 0.0, 4.0]}
+    same = np.array([[1, 1, 2, 2], [3, 5, 0, 4]], float).T  # the runs of a, twice each
+    for name, (ours, theirs) in PAIRS.items():
+        assert ours(ragged) == pytest.approx(theirs(same), abs=1e-12), name
+    assert interquartile_mean(ragged) == (1 + 2 + 2 + 3) / 4
+    assert interquartile_mean({"a": [1.0] * 3, "b": [4.0] * 5}) == 2.5
+
+
+def test_leading_axes_are_kept():
+    many = np.stack([SCORES, SCORES + 1, 2 * SCORES])
+    for ours, _ in PAIRS.values():
+        np.testing.assert_allclose(ours(many), [ours(x) for x in many], rtol=1e-12)
+    found = probability_of_improvement(many, np.stack([OTHERS] * 3))
+    np.testing.assert_allclose(found, [probability_of_improvement(x, OTHERS) for x in many], rtol=1e-12)
+    assert performance_profile(many, THRESHOLDS).shape == (3, 13)
+
+
+def test_probability_of_improvement_counts_pairs_and_half_of_ties():
+    x, y = np.array([[1.0, 5], [3, 5], [2, 5]]), np.array([[2.0, 5], [0, 5]])
+    # First game: 1 beats 0, 3 beats both, 2 beats 0 and ties: 4.5 of 6. Second: ties alone.
+    assert probability_of_improvement(x, y) == pytest.approx((4.5 / 6 + 0.5) / 2)
+    assert probability_of_improvement(x, y) + probability_of_improvement(y, x) == pytest.approx(1)
+    assert probability_of_improvement({"g": [1, 2], "h": [0]}, {"h": [1], "g": [0]}) == 0.5
+    with pytest.raises(ValueError, match="the games differ: g and h"):
+        probability_of_improvement({"g": [1]}, {"h": [1]})
+
+
+@given(x=matrices, runs=st.integers(1, 6))
+def test_probability_of_improvement_is_rliables(x, runs):
+    x = np.array(x, float)
+    y = np.resize(x[::-1].T, (runs, x.shape[1]))
+    ours, theirs = probability_of_improvement(x, y), metrics.probability_of_improvement(x, y)
+    assert ours == pytest.approx(theirs, abs=1e-12)
+    assert probability_of_improvement(x, x) == pytest.approx(0.5)
+
+
+def test_performance_profile_is_rliables_and_strictly_above():
+    scores = np.array([[0.0, 1.0], [1.0, 3.0]])
+    assert performance_profile(scores, [0, 1, 2, 3]).tolist() == [0.75, 0.25, 0.25, 0]
+    assert performance_profile(scores, [0.5, 1, 2], of="games").tolist() == [0.5, 0.5, 0]
+    assert performance_profile({"a": [0, 1, 2, 3], "b": [5]}, [1.5]) == 0.75
+    for of, theirs in (
+        ("runs", library.score_distributions),
+        ("games", library.average_score_distributions),
+    ):
+        ours = performance_profile(SCORES, THRESHOLDS, of=of)
+        np.testing.assert_allclose(ours, theirs(SCORES, THRESHOLDS), atol=1e-12)
+    with pytest.raises(ValueError, match="must be runs or games"):
+        performance_profile(SCORES, THRESHOLDS, of="tasks")
+
+
+def _again(scores: np.ndarray) -> np.ndarray:
+    """Scores drawn again as rliable draws them, from numpy's global generator."""
+    return scores[np.random.choice(len(scores), scores.shape), np.arange(scores.shape[1])]
+
+
+def test_intervals_are_rliables_for_the_same_draws():
+    names = list(PAIRS)
+    np.random.seed(3)
+    points, limits = library.get_interval_estimates(
+        {"arm": SCORES}, lambda x: np.array([PAIRS[n][1](x) for n in names]), reps=200
+    )
+    np.random.seed(3)
+    drawn = np.stack([_again(SCORES) for _ in range(200)])
+    for i, name in enumerate(names):
+        ours = PAIRS[name][0]
+        assert ours(SCORES) == pytest.approx(points["arm"][i], abs=1e-12)
+        np.testing.assert_allclose(percentile_interval(ours(drawn)), limits["arm"][:, i], atol=1e-12)
+
+
+def test_intervals_of_pairs_are_rliables_for_the_same_draws():
+    np.random.seed(4)
+    _, limits = library.get_interval_estimates(
+        {"pair": (SCORES, OTHERS)},
+        lambda x, y: np.array([metrics.probability_of_improvement(x, y)]),
+        reps=30,
+    )
+    np.random.seed(4)
+    x, y = (np.stack(d) for d in zip(*((_again(SCORES), _again(OTHERS)) for _ in range(30)), strict=True))
+    ours = percentile_interval(probability_of_improvement(x, y))
+    np.testing.assert_allclose(ours, limits["pair"][:, 0], atol=1e-12)
+
+
+def test_intervals_of_profiles_are_rliables_for_the_same_draws():
+    np.random.seed(5)
+    _, limits = library.create_performance_profile({"arm": SCORES}, THRESHOLDS, reps=50)
+    np.random.seed(5)
+    drawn = np.stack([_again(SCORES) for _ in range(50)])
+    ours = percentile_interval(performance_profile(drawn, THRESHOLDS))
+    np.testing.assert_allclose(ours, limits["arm"], atol=1e-12)
+
+
+def test_draws_are_with_replacement_within_a_game():
+    # Game a: a mean of 0, 0.5, 0.5 or 1 over two draws, each with 1/4; game b: always 10.
+    scores = {"a": [1.0, 0.0], "b": [10.0, 10.0]}
+    assert bootstrap(mean, scores, level=0.6) == (5.25, 5.0, 5.5)
+    assert bootstrap(mean, scores, level=0.4) == (5.25, 5.25, 5.25)
+
+
+def test_arms_are_drawn_independently():
+    arm = {"a": [0.0, 1.0]}
+    # The difference is -1 or 1 with 1/16 each, so 0.9 holds both; drawn alike it would be 0 throughout.
+    assert bootstrap_difference(arm, arm, level=0.9) == (0, -1, 1)
+    assert bootstrap(probability_of_improvement, arm, arm, level=0.9) == (0.5, 0, 1)
+    shifted = bootstrap_difference(SCORES + 3, SCORES, median, seed=2)
+    assert shifted.point == pytest.approx(3) and shifted.low < 3 < shifted.high
+
+
+def test_equal_arms_are_neither_better_nor_worse():
+    same = np.full((4, 2), 0.3)
+    assert bootstrap(probability_of_improvement, same, same) == (0.5, 0.5, 0.5)
+    assert bootstrap_difference(same, same) == (0, 0, 0)
+
+
+@given(order=st.permutations(range(6)), seed=st.integers(0, 100))
+def test_the_order_of_runs_changes_nothing(order, seed):
+    once = partial(bootstrap, interquartile_mean, repetitions=100, seed=seed)
+    assert once(SCORES) == once(SCORES[order])
+
+
+@given(seed=st.integers(0, 100))
+def test_an_interval_grows_with_its_level_and_holds_a_symmetric_arms_mean(seed):
+    symmetric = np.array([[-2.0, 1], [-1, 2], [0, 3], [1, 4], [2, 5]])
+    narrow, wide = (bootstrap(mean, symmetric, level=level, seed=seed) for level in (0.5, 0.95))
+    assert wide.low < narrow.low < narrow.point < narrow.high < wide.high
+
+
+def test_the_interval_of_ten_normal_runs_covers_less_than_it_says_but_not_by_much():
+    rng = np.random.default_rng(6)
+    found = [bootstrap(mean, rng.normal(size=(10, 1)), repetitions=400, seed=i) for i in range(400)]
+    covered = np.mean([interval.low <= 0 <= interval.high for interval in found])
+    assert 0.85 < covered < 0.97
+
+
+def test_a_single_run_has_no_interval():
+    point, low, high = bootstrap(mean, {"a": [1.0], "b": [2.0, 4.0]})
+    assert point == 2 and np.isnan(low) and np.isnan(high)
+    assert np.isnan(curve_interval([[1.0, 2.0]]).low).all()
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: mean([]), "scores are"),
+        (lambda: mean(np.zeros((0, 2))), "no scores"),
+        (lambda: mean({}), "no scores"),
+        (lambda: mean({"Pong": [1, np.nan]}), "scores of game Pong are not all finite"),
+        (lambda: bootstrap(mean, np.zeros((2, 3, 4))), "bootstrap takes scores"),
+        (lambda: bootstrap(mean, SCORES, repetitions=0), "repetitions=0"),
+        (lambda: bootstrap(mean, SCORES, level=1.0), "level=1.0"),
+        (lambda: bootstrap_difference(SCORES, SCORES[:, :2]), "the games differ"),
+        (lambda: curve_interval([1.0, 2.0]), "curves are"),
+        (lambda: curve_interval({"a": np.ones((2, 3)), "b": np.ones((2, 4))}), "same points"),
+        (lambda: at_equal_steps([]), "no curves"),
+        (lambda: at_equal_steps([([0, 10], [1, 2]), ([20, 30], [1, 2])]), "all 2 curves have"),
+        (lambda: at_equal_steps([([0, 10, 10], [1, 2, 3])]), "whole and ascending"),
+        (lambda: at_equal_steps([([0, 10], [1, np.inf])]), "must be finite"),
+        (lambda: at_equal_steps([([0, 10], [1])]), "steps .N. and returns"),
+        (lambda: area_under_curve([0, 10], [1, 2], until=11), "until=11"),
+        (lambda: reached([]), "no runs"),
+        (lambda: summary({"a": {"Pong": [1]}}, baseline="b"), "baseline b is not one of the arms: a"),
+    ],
+)
+def test_what_cannot_be_computed_is_said_in_a_line(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_curves_have_the_interval_that_their_points_have(monkeypatch):
+    curves = np.sort(np.random.default_rng(7).normal(size=(5, 3, 4)), axis=0)  # as bootstrap sorts runs
+    found = curve_interval(curves, interquartile_mean, seed=9, repetitions=200)
+    for point in range(4):
+        expected = bootstrap(interquartile_mean, curves[..., point], seed=9, repetitions=200)
+        np.testing.assert_allclose([x[point] for x in found], expected, rtol=1e-12)
+    monkeypatch.setattr("srl_jax.statistics.intervals._BLOCK", 1)  # a point at a time
+    np.testing.assert_array_equal(found, curve_interval(curves, interquartile_mean, seed=9, repetitions=200))
+    one = curve_interval(curves[:, 0], seed=1)
+    np.testing.assert_array_equal(one, curve_interval({"Pong": curves[:, 0]}, seed=1))
+
+
+def test_curves_meet_where_all_of_them_are():
+    long, short = ([0, 10, 20, 30, 40], [0, 1, 2, 3, 4]), ([0, 20, 30], [5, 7, 4])
+    steps, returns = at_equal_steps([long, short])
+    assert steps.tolist() == [0, 20, 30] and steps.dtype == np.int64
+    assert returns.tolist() == [[0, 2, 3], [5, 7, 4]]
+    # Different steps: the coarser curve's, the other one's on straight lines; nothing before 5 or after 25.
+    steps, returns = at_equal_steps([([5, 15, 25], [1, 3, 9]), ([0, 8, 12, 20, 28], [0, 8, 0, 0, 8])])
+    assert steps.tolist() == [5, 15, 25]
+    assert returns.tolist() == [[1, 3, 9], [5, 0, 5]]
+    steps, returns = at_equal_steps([([0, 20, 40], [1, 3, 5]), ([10, 20, 30, 40], [7, 8, 9, 0])])
+    assert steps.tolist() == [20, 40] and returns.tolist() == [[3, 5], [8, 0]]
+    steps, returns = at_equal_steps([([0, 10], [1, 3]), ([0], [2])])
+    assert steps.tolist() == [0] and returns.tolist() == [[1], [2]]
+
+
+def test_area_under_a_curve_is_its_mean_over_time():
+    steps, returns = [0, 10, 30], [0.0, 4.0, 6.0]
+    assert area_under_curve(steps, returns) == pytest.approx((20 + 100) / 30)
+    assert area_under_curve(steps, returns, until=10) == 2
+    assert area_under_curve(steps, returns, until=20) == pytest.approx((20 + 45) / 20)
+    assert area_under_curve(steps, returns, until=0) == 0
+    assert area_under_curve([100], [3.0]) == 3
+    np.testing.assert_allclose(area_under_curve(steps, [returns, [7, 7, 7]]), [4, 7])
+
+
+def test_steps_to_a_score_lie_on_the_line_that_crosses_it_first():
+    steps = [0, 10, 20, 30]
+    curves = [[0, 4, 0, 8], [3, 0, 0, 9], [0, 1, 2, 2], [0, 0, 3, 3]]
+    np.testing.assert_allclose(steps_to(steps, curves, 3), [7.5, 0, np.nan, 20])
+    assert steps_to(steps, curves[0], 4) == 10
+
+
+def test_a_run_that_never_reached_a_score_counts_as_infinitely_late():
+    assert reached([30, np.nan, 10]) == (2, 3, 30)
+    assert reached([np.nan, np.nan, 10]) == (1, 3, np.inf)
+    assert reached([10, 20, np.nan, np.nan]) == (2, 4, np.inf)
+    assert reached([10, 20]) == (2, 2, 15)
+
+
+def test_a_summary_has_every_number_with_its_interval_and_its_runs():
+    arms = {
+        "joint": {"Pong": [14.6, -20.7, 14.6], "Breakout": [30.5, 1.7]},
+        "rl_only": {"Pong": [-20.7, -20.7, -20.7], "Qbert": [100.0]},
+    }
+    rows = summary(arms, baseline="rl_only", repetitions=200)
+    by_key = {(row["arm"], row["game"], row["statistic"]): row for row in rows}
+    assert len(by_key) == len(rows)
+    json.dumps(rows, allow_nan=False)
+    assert by_key["joint", None, "mean"]["point"] == pytest.approx(2 / 3)  # of Pong, which both have
+    assert by_key["joint", None, "optimality_gap"]["point"] == pytest.approx(1 / 3)
+    assert by_key["joint", "Breakout", "return"]["point"] == pytest.approx(16.1)
+    assert by_key["joint", "Breakout", "return"]["runs"] == "2 runs"
+    assert by_key["rl_only", "Qbert", "return"]["low"] is None
+    better = by_key["joint", None, "probability_of_improvement"]
+    assert better["against"] == "rl_only" and better["point"] == pytest.approx((2 + 0.5) / 3)
+    assert by_key["joint", None, "mean_difference"]["point"] == pytest.approx(2 / 3)
+    difference = by_key["joint", "Pong", "return_difference"]
+    assert difference["point"] == pytest.approx(35.3 * 2 / 3)
+    assert difference["low"] <= difference["point"] <= difference["high"]
+    names = {statistic for arm, game, statistic in by_key if arm == "joint" and game is None}
+    aggregates = set(statistics.AGGREGATES)
+    assert names == aggregates | {f"{n}_difference" for n in aggregates} | {"probability_of_improvement"}
+    assert not any(row["against"] for row in rows if row["arm"] == "rl_only")
+
+
+def test_the_number_of_runs_in_words():
+    assert runs_text({"Pong": [1]}) == "1 run"
+    assert runs_text(np.zeros((5, 2))) == "5 runs of each of 2 games"
+    assert runs_text({"Pong": [1, 2], "Qbert": [1]}) == "Pong 2 runs, Qbert 1 run"
+
+
+def test_statistics_import_no_jax():
+    code = "import sys, srl_jax.statistics; sys.exit(bool({'jax', 'gymnasium', 'pandas'} & set(sys.modules)))"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
