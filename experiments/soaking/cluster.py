@@ -30,7 +30,7 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
         return [Count("a Ray cluster", 0, 0, "skipped: Ray is not installed")]
     alone, spread = folder / "alone", folder / "spread"
     flags = (*SWEEP, "--seeds=1", "--steps=1600") if short else SWEEP
-    sweeps.left_alone(sweeps.command(alone, flags), say)
+    sweeps.left_alone(sweeps.command("sweep", alone, flags), say)
     detail = disturbed(spread, flags, 1 if short else WORKERS_KILLED, random.Random(0), say)
     return [sweeps.compared("a Ray cluster of two nodes", alone, spread, say, detail)]
 

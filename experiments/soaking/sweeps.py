@@ -1,8 +1,9 @@
-"""Sweeps that are killed and started again, against the same sweep left alone.
+"""Figures whose sweep is killed and started again, against the same figures from a sweep left alone.
 
 Half of the kills take the sweep's process alone, whose runs then write a checkpoint and end; the others
 take its runs with it, as a machine does that loses power. In the end every run must be complete once, with
-the rows and parameters that it has in the other sweep, bit for bit.
+the rows and parameters that it has in the other sweep, bit for bit; and the figures and their numbers must be
+the same files.
 """
 
 import os
@@ -29,24 +30,27 @@ SMALL = (
 )  # fmt: skip
 """Settings of runs that take some seconds once they have begun."""
 
-SWEEP = ("--presets=small/frozen_256,small/joint_256", "--seeds=2", *SMALL)
-"""Eight runs: two seeds of two arms, of a pretraining, and of the agent on whose frames that one trains."""
+FIGURES = ("--figure=6.3,A.1", "--seeds=2", *SMALL)
+"""Ten runs, two seeds each: three arms, a fourth that starts from a pretrained encoder, and its pretraining, on
+frames of the first."""
 
 KILLS = 20
 
 
 def soak(short: bool, folder: Path, say: Say) -> list[Count]:
     """See the module."""
-    flags = (*SWEEP, "--seeds=1", "--steps=1600") if short else SWEEP
+    flags = (*FIGURES, "--seeds=1", "--steps=1600") if short else FIGURES
     alone, killed = folder / "alone", folder / "killed"
-    seconds = left_alone(command(alone, flags), say)
-    kills = until_done(command(killed, flags), 2 if short else KILLS, seconds, random.Random(0), say)
-    return [compared("killed sweeps", alone, killed, say, f"{sum(kills)} kills, {kills[1]} with all runs")]
+    seconds = left_alone(command("figures", alone, flags), say)
+    line = command("figures", killed, flags)
+    kills = until_done(line, 2 if short else KILLS, seconds, random.Random(0), say)
+    detail = f"{sum(kills)} kills, {kills[1]} of them with everything that ran"
+    return [compared("runs of a killed sweep", alone, killed, say, detail), same_files(alone, killed, say)]
 
 
-def command(root: Path, flags: Sequence[str]) -> list[str]:
-    """A sweep's command line."""
-    return [sys.executable, "-m", "experiments.sweep", *flags, f"--out={root}", "--workers=2"]
+def command(entry_point: str, root: Path, flags: Sequence[str]) -> list[str]:
+    """A sweep's command line, of experiments.sweep or experiments.figures."""
+    return [sys.executable, "-m", f"experiments.{entry_point}", *flags, f"--out={root}", "--workers=2"]
 
 
 def left_alone(line: Sequence[str], say: Say) -> float:
@@ -134,6 +138,19 @@ def compared(what: str, alone: Path, other: Path, say: Say, detail: str) -> Coun
             say(f"sweeps: {name}: {', '.join(problems)}")
     aside = len(list(other.glob("*/*/*.broken-*")))
     return Count(what, len(names), wrong + aside, detail)
+
+
+def same_files(alone: Path, other: Path, say: Say) -> Count:
+    """The figures of a sweep against those of the sweep left alone, byte for byte."""
+    names = sorted(path.relative_to(alone) for path in (alone / "figures").rglob("*.*"))
+    wrong = [name for name in names if _bytes(alone / name) != _bytes(other / name)]
+    for name in wrong:
+        say(f"sweeps: {name} differs")
+    return Count("their figures and the figures' numbers", len(names), len(wrong), "compared byte for byte")
+
+
+def _bytes(path: Path) -> bytes:
+    return path.read_bytes() if path.exists() else b""
 
 
 def differing(alone: Path, other: Path, name: str) -> list[str]:
