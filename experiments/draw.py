@@ -10,10 +10,11 @@ from typing import Any
 
 from absl import flags
 
+from experiments import diagnostic_plots, plots
 from experiments import flags as config_flags
-from experiments import plots
 from srl_jax.config import Config
 from srl_jax.data import thesis_curve
+from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import KINDS, read_metrics
 from srl_jax.specs import LIMITS
@@ -22,7 +23,7 @@ FLAGS = flags.FLAGS
 
 
 def draw_run(run: Path, config: Config, *, thesis: str = "", pictures: dict | None = None) -> list[Path]:
-    """Draws `figures/` of a run directory: learning curve, losses, and a panel for each objective.
+    """Draws `figures/` of a run directory: learning curve, losses, diagnostics, a panel for each objective.
 
     Args:
         run: the run directory.
@@ -46,6 +47,8 @@ def draw_run(run: Path, config: Config, *, thesis: str = "", pictures: dict | No
         rows, figures / "learning_curve.png", title, _reference(config, thesis) if thesis else None
     )
     written = [curve, plots.losses(rows, figures / "losses.png")]
+    written.append(diagnostic_plots.diagnostics(rows, figures / "diagnostics.png", title))
+    written.append(diagnostic_plots.drift_matrix(rows, figures / "drift.png", title))
     for name, (inputs, targets, outputs) in (pictures or {}).items():
         path = figures / f"{name}.png"
         written.append(plots.image_panel(inputs, targets, outputs, path, f"{title}: {name}"))
@@ -67,17 +70,30 @@ def read_rows(path: Path) -> list[dict]:
     for number, row in enumerate(rows, 1):
         if row.get("kind") not in KINDS:
             raise ConfigError(f"{path}, line {number}: kind is none of {', '.join(KINDS)}")
-        if type(row.get("env_steps")) is not int or not 0 <= row["env_steps"] <= LIMITS[int]:
+        if not _is_count(row.get("env_steps")):
             raise ConfigError(f"{path}, line {number}: env_steps is no count")
         for key, value in row.items():
             if key == "eval/returns":
                 good = isinstance(value, list) and all(map(_is_number, value))
+            elif key == STEPS:
+                good = isinstance(value, list) and all(map(_is_count, value))
+            elif key.startswith("diag/"):
+                good = all(map(_is_number, value)) if isinstance(value, list) else _is_number(value)
             else:
                 drawn = key == "eval/return_mean" or key.split("/")[0] in ("loss", "grad_norm")
                 good = not drawn or _is_number(value)
             if not good:
                 raise ConfigError(f"{path}, line {number}: {key} is not made of numbers of single precision")
+    for name in drift_names(rows):
+        try:
+            drift_matrix(rows, name)
+        except ValueError as error:
+            raise ConfigError(f"{path}: {error}") from None
     return rows
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= LIMITS[int]
 
 
 def _is_number(value: Any) -> bool:

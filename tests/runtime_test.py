@@ -21,6 +21,9 @@ JAX_CACHE = {
 }
 
 
+AT_START = runtime.MALLOC | runtime.BLAS
+
+
 def _wanted(env, encoder="nature", **given):
     defaults = {"glibc": True, "gpu": False, "cache": CACHE, "cores": 2, "works": lambda flags: True}
     return runtime.wanted(env, encoder, **(defaults | given))
@@ -31,23 +34,23 @@ def _never(flags):
 
 
 def test_the_wanted_environment():
-    everything = runtime.MALLOC | JAX_CACHE | {"XLA_FLAGS": YNN}
+    everything = AT_START | JAX_CACHE | {"XLA_FLAGS": YNN}
     assert _wanted({}) == everything
     assert _wanted({}, "sac_ae:features=256") == everything | {"NPROC": "3"}
     assert _wanted({"NPROC": "1"}, "sac_ae") == everything
     assert _wanted({}, "sac_ae", gpu=True) == JAX_CACHE
     assert _wanted(everything, works=_never) == {}
-    assert _wanted({}, "tiny", works=_never) == runtime.MALLOC | JAX_CACHE
+    assert _wanted({}, "tiny", works=_never) == AT_START | JAX_CACHE
     assert _wanted({}, glibc=False) == JAX_CACHE | {"XLA_FLAGS": YNN}
     assert _wanted({}, gpu=True, works=_never) == JAX_CACHE
-    assert _wanted({}, cache=None) == runtime.MALLOC | {"XLA_FLAGS": YNN}
-    assert _wanted({}, works=lambda flags: False) == runtime.MALLOC | JAX_CACHE
+    assert _wanted({}, cache=None) == AT_START | {"XLA_FLAGS": YNN}
+    assert _wanted({}, works=lambda flags: False) == AT_START | JAX_CACHE
 
 
 def test_what_the_user_has_set_stays():
-    others = {name: value for name, value in runtime.MALLOC.items() if name != "MALLOC_MMAP_MAX_"}
+    others = {name: value for name, value in AT_START.items() if name != "MALLOC_MMAP_MAX_"}
     assert _wanted({"MALLOC_MMAP_MAX_": "7"}, "tiny", cache=None) == others
-    assert _wanted({"GLIBC_TUNABLES": "glibc.malloc.mmap_max=1"}, "tiny", cache=None) == {}
+    assert _wanted({"GLIBC_TUNABLES": "glibc.malloc.mmap_max=1"}, "tiny", cache=None) == runtime.BLAS
     # An empty directory is how jax is told to keep nothing; a directory of the user's has its own limits.
     for folder in ("", "/elsewhere"):
         assert _wanted({"JAX_COMPILATION_CACHE_DIR": folder}, "tiny", glibc=False) == {}
@@ -194,7 +197,7 @@ def test_it_restarts_once_with_everything(started, tmp_path, capsys):
     ((program, arguments, given),) = started
     assert program == sys.executable
     assert arguments == [sys.executable, "-X", "dev", "-m", "experiments.train", "--out=a b"]
-    assert given.items() >= (env | runtime.MALLOC | {"XLA_FLAGS": YNN, runtime.GUARD: "tuned"}).items()
+    assert given.items() >= (env | AT_START | {"XLA_FLAGS": YNN, runtime.GUARD: "tuned"}).items()
     assert pathlib.Path(given["JAX_COMPILATION_CACHE_DIR"]).parent == tmp_path / "srl_jax" / "xla"
     line = capsys.readouterr().err.split("\n")[0]
     assert line.startswith("runtime: restarting with MALLOC_MMAP_MAX_=0 MALLOC_TRIM") and YNN in line
@@ -208,7 +211,7 @@ def test_it_restarts_once_with_everything(started, tmp_path, capsys):
 def test_the_guard_forbids_a_restart_but_not_the_rest(started, tmp_path, capsys):
     env = {"XDG_CACHE_HOME": str(tmp_path), runtime.GUARD: "tuned"}
     runtime.prepare("auto", "nature", env)
-    assert not started and not runtime.MALLOC.keys() & env.keys()
+    assert not started and not AT_START.keys() & env.keys()
     assert env["XLA_FLAGS"] == YNN and "JAX_COMPILATION_CACHE_DIR" in env
     printed = capsys.readouterr()
     assert printed.out == "" and printed.err.count("\n") == 1
@@ -249,9 +252,7 @@ def test_the_flag_is_a_flag_of_both_entry_points():
 
 
 def _entry_point(module, *arguments, **env):
-    present = {
-        name: value for name, value in os.environ.items() if name not in (*runtime.MALLOC, runtime.GUARD)
-    }
+    present = {name: value for name, value in os.environ.items() if name not in (*AT_START, runtime.GUARD)}
     return subprocess.run(
         [sys.executable, "-m", module, *arguments],
         cwd=ROOT,

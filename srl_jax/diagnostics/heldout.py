@@ -18,7 +18,7 @@ WINDOWS = 512
 ENVS = 4
 STRIDE = 4
 """Env steps between two observations that are kept, on average: neighbours look alike."""
-LONGEST = 100
+LONGEST = 80
 """Env steps after which an episode is left for another one: a probe is fitted on some, scored on others."""
 
 

@@ -19,11 +19,11 @@ from srl_jax.optim import real_copy
 from srl_jax.types import Params, TrainState, Window
 from srl_jax.update import Hyper
 
-BATCH = 64
+BATCH = 32
 """Observations that are encoded or decoded in one call."""
-DECODED = 256
+DECODED = 128
 """Held-out observations, the first ones, that the decoder of now is measured on."""
-CROSSED = 64
+CROSSED = 32
 """Those of them that decoders and encoders of different epochs are measured on: there are many pairs."""
 
 
@@ -113,6 +113,8 @@ class Diagnostics:
             "drift/cosine": [measures.mean_cosine(z, then.latents) for then in kept.values()],
             "drift/cka": [measures.alignment(now.gram, then.gram) for then in kept.values()],
         }
+        if self._config.frame_stack > 1:
+            values["moving_share"] = measures.moving_share(held_out.observations)
         for name in params["heads"]:
             values |= self._decoded(name, now, list(kept.values()))
         if window is not None and self._functions.conflict is not None:
@@ -147,18 +149,13 @@ class Diagnostics:
         }
         if targets.shape[-1] == 2:  # else nothing tells what moves
             found = measures.moving_errors(targets[..., 0], targets[..., 1], outputs[..., 1])
-            values["moving_share"] = found.pop("moving_share")
             values |= {f"error/{name}/{what}": value for what, value in found.items()}
         return values
 
     def _decode(self, name: str, head: Params, latents: np.ndarray, number: int) -> list[tuple]:
         """What `Functions.decode` says of the first so many held-out observations, batch by batch."""
-        return [
-            jax.device_get(
-                self._functions.decode[name](head, latents[part], _rows(self._held_out.windows, part))
-            )
-            for part in _parts(number)
-        ]
+        decode, windows = self._functions.decode[name], self._held_out.windows
+        return [jax.device_get(decode(head, latents[p], _rows(windows, p))) for p in _parts(number)]
 
     def _keep(self, params: Params) -> Kept:
         observations = self._held_out.observations

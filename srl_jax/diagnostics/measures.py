@@ -9,7 +9,7 @@ CONSTANT = 1e-6
 MOVING = 0.1
 """A pixel moves if it differs by more than this, in units of full brightness, from the frame before: 26
 levels of 255. In Pong and Catch 0.5 % of the pixels do, in front of CatchDistractor's background 28 %."""
-RIDGES = tuple(10.0**k for k in range(-4, 3))
+RIDGES = tuple(10.0**k for k in range(-4, 4))
 """What a probe's regularisation is chosen from, in units of the mean squared norm of an observation's
 standardised latent."""
 
@@ -99,8 +99,8 @@ def moving_errors(before: np.ndarray, target: np.ndarray, output: np.ndarray) ->
     Returns:
         `moving`, `static`: mean squared error on the pixels of the target that differ from the frame before
         by more than `MOVING`, and on the others. `moving_explained`: 1 - `moving` over the same error of the
-        targets' mean image, which knows nothing of an observation: 1 is perfect, 0 has lost what moves.
-        `moving_share`: of the pixels. NaN where there is no such pixel.
+        targets' mean image, which knows nothing of an observation: 1 is perfect, 0 has lost what moves. NaN
+        where there is no such pixel.
     """
     target, output = target.astype(np.float64), output.astype(np.float64)
     moves = np.abs(target - before) > MOVING
@@ -114,16 +114,21 @@ def moving_errors(before: np.ndarray, target: np.ndarray, output: np.ndarray) ->
         "moving": moving,
         "static": mean(error, ~moves),
         "moving_explained": 1.0 - moving / of_mean if of_mean else float("nan"),
-        "moving_share": float(moves.mean()),
     }
+
+
+def moving_share(observations: np.ndarray) -> float:
+    """The share of pixels of the newest frame that move: uint8 [N, S, H, W], S at least 2."""
+    before, now = (observations[:, i].astype(np.float32) / 255.0 for i in (-2, -1))
+    return float((np.abs(now - before) > MOVING).mean())
 
 
 def probe(latents: np.ndarray, states: np.ndarray, episodes: np.ndarray) -> np.ndarray:
     """How well a linear function of the latent gives each variable of the state, on episodes not seen before.
 
     Ridge regression from standardised units to standardised variables, fitted on every second episode. Its
-    regularisation is the one of `RIDGES` with the smallest leave-one-out error there, for each variable
-    (Allen's PRESS, in closed form).
+    regularisation is the one of `RIDGES` with the smallest error there when each episode is predicted from
+    the others, for each variable: observations of one episode look alike.
 
     Args:
         latents: [N, D].
@@ -151,11 +156,17 @@ def probe(latents: np.ndarray, states: np.ndarray, episodes: np.ndarray) -> np.n
     eigenvalues, vectors = np.linalg.eigh(z[fits] @ z[fits].T)
     eigenvalues, turned = eigenvalues.clip(0.0), vectors.T @ y[fits]
     unit = eigenvalues.sum() / len(eigenvalues)
+    together = [np.flatnonzero(order[fits] == episode) for episode in np.unique(order[fits])]
     best, weights = np.full(y.shape[1], np.inf), np.zeros((fits.sum(), y.shape[1]))
     for ridge in RIDGES:
         inverse = 1.0 / (eigenvalues + ridge * unit)
         dual = vectors @ (inverse[:, None] * turned)
-        left_out = ((dual / ((vectors**2) @ inverse)[:, None]) ** 2).mean(0)
+        # The errors on observations that are left out together: the block of the inverse, inverted (Allen's
+        # PRESS is the case of one).
+        inverted = (vectors * inverse) @ vectors.T
+        left_out = sum(
+            (np.linalg.solve(inverted[np.ix_(one, one)], dual[one]) ** 2).sum(0) for one in together
+        )
         better = left_out < best
         best[better], weights[:, better] = left_out[better], dual[:, better]
     error = ((z[~fits] @ (z[fits].T @ weights) - y[~fits]) ** 2).sum(0)

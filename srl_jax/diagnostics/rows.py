@@ -35,9 +35,11 @@ def drift_matrix(rows: Iterable[Mapping[str, Any]], name: str) -> tuple[np.ndarr
     for row in rows:
         now, steps = row["env_steps"], row[STEPS]
         decoder_now, encoder_now = row[DECODER_NOW + name], row.get(ENCODER_NOW + name, [])
+        if not isinstance(decoder_now, list) or not isinstance(encoder_now, list):
+            raise ValueError(f"drift of {name} after {now} env steps is no list")
         if (len(decoder_now), len(encoder_now)) != (len(steps) + 1, len(steps)):
             raise ValueError(
-                f"row of {now} env steps: drift of {name} is not over its {len(steps)} kept epochs"
+                f"drift of {name} after {now} env steps is not over its {len(steps)} kept epochs"
             )
         kept |= set(steps)
         known |= {(now, then): error for then, error in zip([*steps, now], decoder_now, strict=True)}
