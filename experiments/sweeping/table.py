@@ -96,8 +96,8 @@ def summary(root: Path, view: View, left: tuple[float, int] | None) -> str:
     parts += [f"{number} {what}" for what, number in counts.items() if number]
     if left is not None and (view.running or view.waiting):
         seconds, unknown = left
-        text = f"{hms(seconds)} left" if unknown < total else "time left unknown"
-        if 0 < unknown < total:
+        text = f"{hms(seconds)} left" if seconds else "time left unknown"
+        if seconds and unknown:
             text += f" and {unknown} of unknown speed"
         parts.append(text)
     return f"{', '.join(parts)} | {root}"
