@@ -124,6 +124,19 @@ def test_a_run_that_ends_well_has_to_be_complete(stubs):
     assert stubs.count(B) == 1
 
 
+def test_another_version_of_the_code_fails_its_run_and_not_the_sweep(stubs):
+    """Runs are started with the code that lies there then, which somebody may have changed."""
+    stubs.acts(a=["slow"])
+    path = stubs.root / "stub" / f"{A}.json"
+    content = json.loads(path.read_text())
+    content["config"]["new"] = 1
+    path.write_text(json.dumps(content))
+    outcome = stubs.run()
+    assert "no field 'new'" in outcome.failed[A] and outcome.done == [B] and C in outcome.blocked
+    with pytest.raises(ConfigError, match="no field 'new'"):  # and the next sweep says so at once
+        stubs.run()
+
+
 def test_broken_directories_are_moved_aside_and_nothing_is_lost(stubs, capsys):
     assert stubs.run().status == 0
     for name, spoil in {
@@ -287,6 +300,40 @@ def test_flags_of_training_go_to_every_run(tmp_path):
     }  # fmt: skip
     with pytest.raises(ConfigError, match="--gpus_per_run: only --launcher=ray"):
         sweep.launcher_options(_main(f"--out={tmp_path}", "--gpus_per_run=1")[0])
+
+
+def test_a_sweep_goes_on_as_it_was_planned_where_no_presets_are_given(stubs):
+    assert stubs.run().status == 0
+    values, root = _main(f"--out={stubs.root}")
+    assert sweep.chosen_runs(values, root) == RUNS
+    values, root = _main(f"--out={stubs.root}", "--gamma=0.9")
+    with pytest.raises(ConfigError, match="--gamma: only with --presets"):
+        sweep.chosen_runs(values, root)
+
+
+@pytest.mark.parametrize(
+    "spoil",
+    [
+        lambda about: "{",
+        lambda about: "[]",
+        lambda about: json.dumps({**about, "format": 9}),
+        lambda about: json.dumps({**about, "runs": [{}]}),
+        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "name": "../../x"}]}),
+        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "name": "a/../x"}]}),
+        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "flags": {"steps": 3}}]}),
+        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "flags": []}]}),
+        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "config": {"steps": -1}}]}),
+        lambda about: "[" * 100_000,
+    ],
+)
+def test_a_manifest_that_is_none_is_refused_in_one_line(stubs, spoil):
+    stubs.root.mkdir(exist_ok=True)
+    manifest.write(stubs.root, {A: manifest.Entry(RUNS[0], CONFIG)})
+    path = stubs.root / "sweep.json"
+    path.write_text(spoil(json.loads(path.read_text())))
+    with pytest.raises(ConfigError, match="sweep.json: ") as refused:
+        manifest.read(stubs.root)
+    assert "\n" not in str(refused.value)
 
 
 def test_a_dry_run_writes_nothing_and_counts(stubs):

@@ -63,8 +63,10 @@ def test_a_task_is_stopped_by_a_file(here, tmp_path):
 
 def test_without_ray_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    stubs = Sweep(tmp_path / "new")
     with pytest.raises(ConfigError, match=r"pip install 'srl-jax\[ray\]'"):
-        ray_launcher.Ray(tmp_path, None, 1, 0.0, 0, None, list)
+        stubs.run(launcher="ray")
+    assert not stubs.root.exists()
 
 
 def test_the_task_needs_nothing_but_its_texts(tmp_path):

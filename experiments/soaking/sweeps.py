@@ -31,8 +31,8 @@ SMALL = (
 """Settings of runs that take some seconds once they have begun."""
 
 FIGURES = ("--figure=6.3,A.1", "--seeds=2", *SMALL)
-"""Ten runs, two seeds each: three arms, a fourth that starts from a pretrained encoder, and its pretraining, on
-frames of the first."""
+"""Ten runs, two seeds each: three arms, a fourth that starts from a pretrained encoder, and its pretraining
+on frames of the first."""
 
 KILLS = 20
 
