@@ -8,6 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from absl import flags
 
 from experiments import diagnostic_plots, plots
@@ -21,15 +22,26 @@ from srl_jax.specs import LIMITS
 
 FLAGS = flags.FLAGS
 
+GIF_SIZE = 84
+"""Pixels: height and width of play.gif, where frames are smaller by a whole factor."""
 
-def draw_run(run: Path, config: Config, *, thesis: str = "", pictures: dict | None = None) -> list[Path]:
-    """Draws `figures/` of a run directory: learning curve, losses, diagnostics, a panel for each objective.
+
+def draw_run(
+    run: Path,
+    config: Config,
+    *,
+    thesis: str = "",
+    pictures: dict | None = None,
+    recording: np.ndarray | None = None,
+) -> list[Path]:
+    """Draws `figures/` of a run directory: learning curve, losses, diagnostics, panels of objectives, games.
 
     Args:
         run: the run directory.
         config: of the run.
         thesis: FIGURE/ARM, a curve of the thesis to draw beside the run's own; empty for none.
         pictures: {objective: (inputs, targets, outputs)}, see `srl_jax.loop.Result`.
+        recording: uint8 [T, H, W], likewise; play.gif.
 
     Returns:
         The files written; empty if matplotlib is not installed.
@@ -52,6 +64,9 @@ def draw_run(run: Path, config: Config, *, thesis: str = "", pictures: dict | No
     for name, (inputs, targets, outputs) in (pictures or {}).items():
         path = figures / f"{name}.png"
         written.append(plots.image_panel(inputs, targets, outputs, path, f"{title}: {name}"))
+    if recording is not None:
+        scale = max(1, GIF_SIZE // recording.shape[1])
+        written.append(plots.gif(recording, figures / "play.gif", scale=scale))
     return [path for path in written if path]
 
 

@@ -85,7 +85,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         epsilon=config.eps_eval if FLAGS.epsilon is None else FLAGS.epsilon,
         stack=config.frame_stack,
         max_steps=config.eval_max_steps,
-        record=bool(FLAGS.gif),
+        record=config.eval_max_steps + 1 if FLAGS.gif else 0,
     )
     result = {
         "game": config.game,
@@ -98,7 +98,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     if FLAGS.gif:
         from experiments import plots
 
-        plots.gif(played.frames, FLAGS.gif)
+        plots.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ Flags are defined here, for the entry points, and nowhere else in the library. I
 """
 
 import difflib
+import functools
 import logging
 import os
 import sys
@@ -229,12 +230,15 @@ def fail(message: Any, status: int = 2) -> NoReturn:
     sys.exit(status)
 
 
-def parse(argv: list[str], values: flags.FlagValues = flags.FLAGS) -> list[str]:
+def parse(
+    argv: list[str], values: flags.FlagValues = flags.FLAGS, positional: str | None = None
+) -> list[str]:
     """Parses a command line; exits with one line and status 2 where it is not valid.
 
     Args:
         argv: the program's name and its arguments.
         values: where the flags are defined.
+        positional: a flag whose value may be given without its name; None for none.
 
     Returns:
         [the program's name].
@@ -242,8 +246,13 @@ def parse(argv: list[str], values: flags.FlagValues = flags.FLAGS) -> list[str]:
     # absl would wait for a pipe there, read a device without end, and end in tracebacks.
     if any(argument.lstrip("-").partition("=")[0] == "flagfile" for argument in argv[1:]):
         fail("--flagfile: not taken; write the flags themselves, or use --preset")
+    # Else an argument without a name would end the flags.
+    values.set_gnu_getopt(positional is not None)
     try:
         rest = values(argv)
+        if positional and len(rest) > 1 and not values[positional].present:
+            values[positional].parse(rest.pop(1))
+            values[positional].present += 1
     except flags.UnrecognizedFlagError as error:
         near = difflib.get_close_matches(error.flagname, list(values), n=1, cutoff=0.6)
         suggestion = f"did you mean --{near[0]}? " if near else ""
@@ -267,12 +276,13 @@ def guarded(main: Callable[[list[str]], Any]) -> Callable[[list[str]], Any]:
     return call
 
 
-def run(main: Callable[[list[str]], Any]) -> None:
+def run(main: Callable[[list[str]], Any], positional: str | None = None) -> None:
     """Runs an entry point: parses the flags, and ends with a line and a status where it fails; see `guarded`.
 
     Args:
         main: takes [the program's name]; may return the exit status.
+        positional: see `parse`.
     """
     # absl prints what libraries log, and jax logs every accelerator that it does not find.
     logging.getLogger("jax").setLevel(logging.WARNING)
-    app.run(guarded(main), flags_parser=parse)
+    app.run(guarded(main), flags_parser=functools.partial(parse, positional=positional))

@@ -220,7 +220,7 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
         return
     for path, config, result in zip(paths, configs, results, strict=True):
         try:
-            draw_run(path, config, pictures=result.pictures)
+            draw_run(path, config, pictures=result.pictures, recording=result.recording)
         except OSError as error:
             raise SaveError(f"{path}: no figures: {error.strerror}") from error
 

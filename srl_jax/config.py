@@ -11,6 +11,7 @@ import json
 import os
 import platform
 import subprocess
+import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from srl_jax.specs import Info
 _PACKAGES = (
     "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
 )  # fmt: skip
-_ABOUT = ("versions", "git_revision", "environment")
+_ABOUT = ("versions", "git_revision", "environment", "started", "cpus")
 """What config.json holds beside the fields of Config."""
 
 PARTIAL = "config.json.partial"
@@ -237,8 +238,11 @@ class Config:
             raise ConfigError(f"{path}: {error}") from None
 
     def save(self, run: str | Path) -> None:
-        """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told."""
+        """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told; also
+        when the run began (UTC), and how many CPUs the machine has.
+        """
         about = {"versions": versions(), "git_revision": git_revision(), "environment": told_to_xla()}
+        about |= {"started": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()), "cpus": os.cpu_count()}
         text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)
         partial = Path(run) / PARTIAL
         with open(partial, "w", encoding="utf-8") as file:

@@ -14,7 +14,8 @@ class Evaluation(NamedTuple):
     Attributes:
         returns: the raw score of each game, undiscounted.
         lengths: env steps of each game.
-        frames: uint8 [T, H, W], the first game as it was seen; empty unless asked for.
+        frames: uint8 [T, H, W], the first environment's games as they were seen, one after the other; empty
+            unless asked for.
     """
 
     returns: list[float]
@@ -31,7 +32,7 @@ def evaluate(
     epsilon: float,
     stack: int = 4,
     max_steps: int = 27_000,
-    record: bool = False,
+    record: int = 0,
     stop: Callable[[], bool] = lambda: False,
 ) -> Evaluation | None:
     """Plays full games: a lost life ends nothing, rewards are the game's own.
@@ -46,7 +47,7 @@ def evaluate(
         epsilon: given to the policy.
         stack: frames in an observation.
         max_steps: env steps after which a game is cut, its score counted as it stands.
-        record: keep the first game's frames.
+        record: frames of the first environment to keep at most.
         stop: asked before every step; once it says so, the games are left and there is no result.
     """
     number = env.num_envs
@@ -57,7 +58,7 @@ def evaluate(
     scores = [[] for _ in range(number)]
     share = [len(range(i, games, number)) for i in range(number)]
     score, length = np.zeros(number), np.zeros(number, int)
-    recorded = [frames[0]] if record else []
+    recorded = [frames[0]][:record]
     step = 0
     while any(len(done) < wanted for done, wanted in zip(scores, share, strict=True)):
         if stop():
@@ -67,7 +68,7 @@ def evaluate(
         score += rewards
         length += 1
         stacks.push(frames)
-        if record and not scores[0]:
+        if len(recorded) < record and len(scores[0]) < share[0]:
             recorded.append(frames[0])
         over = terminated | truncated | (length >= max_steps)
         if over.any():
@@ -76,6 +77,8 @@ def evaluate(
             score[over], length[over] = 0.0, 0
             frames, _ = env.reset(options={"reset_mask": over})
             stacks.begin(frames, over)
+            if over[0] and len(recorded) < record and len(scores[0]) < share[0]:
+                recorded.append(frames[0])
     played = [scores[i % number][i // number] for i in range(games)]
     return Evaluation(
         returns=[r for r, _ in played],

@@ -33,6 +33,8 @@ from srl_jax.update import Hyper, make_latents, named_key
 
 PICTURES = 6
 """Examples in the picture of what an objective learnt."""
+RECORDED = 501
+"""Frames of the last evaluation that are kept: of 500 env steps."""
 
 
 class Result(NamedTuple):
@@ -43,12 +45,14 @@ class Result(NamedTuple):
         interrupted: whether it was stopped before its end; its checkpoint is of that moment.
         pictures: {objective: (inputs, targets, outputs)}, float32 [B, H, W, S] each, of objectives that
             have one.
+        recording: uint8 [T, H, W], the first games of the last evaluation; None without one.
     """
 
     env_steps: int
     updates: int
     interrupted: bool
     pictures: dict[str, tuple]
+    recording: np.ndarray | None
 
 
 class Evaluating(NamedTuple):
@@ -198,6 +202,7 @@ class Run:
         self.eval_key = named_key(self.key, "eval")
         self.eval_env = None
         self.evaluating: Evaluating | None = None
+        self.recording: np.ndarray | None = None  # frames of the last evaluation, uint8 [T, H, W]
         self.stopped = False  # says to the evaluation that nobody waits for it
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
@@ -236,7 +241,7 @@ class Run:
             self.env.close()
             if self.eval_env is not None:
                 self.eval_env.close()
-        return Result(self.env_steps, self.updates, not finished, pictures)
+        return Result(self.env_steps, self.updates, not finished, pictures, self.recording)
 
     def run(self) -> bool:
         """To the last env step, or to the return that ends the run; False where it was told to stop."""
@@ -451,6 +456,7 @@ class Run:
                 epsilon=config.eps_eval,
                 stack=config.frame_stack,
                 max_steps=config.eval_max_steps,
+                record=RECORDED,
                 stop=lambda: self.stopped,
             )
             return played, time.perf_counter() - began
@@ -467,6 +473,7 @@ class Run:
             return
         (future, _, env_steps, updates, diagnosed), self.evaluating = self.evaluating, None
         played, seconds = future.result()
+        self.recording = played.frames
         mean = float(np.mean(played.returns))
         values = {
             "eval/return_mean": mean,

@@ -29,6 +29,8 @@ def take(run: "Run") -> State:
     learner = {"slow": state.slow, "opt_state": state.opt_state, "step": state.step}
     trees = {"learner": learner | {"key": jax.random.key_data(state.key)}}
     arrays = {"stacks": run.stacks.frames}
+    if run.recording is not None:
+        arrays["recording"] = run.recording
     replay_arrays, replay_numbers = run.replay.snapshot()
     arrays |= {f"replay_{name}": x for name, x in replay_arrays.items()}
     arrays |= {f"env_{name}": x for name, x in run.env.snapshot().items()}
@@ -117,6 +119,11 @@ def _put(run: "Run", manifest: Manifest, numbers: dict[str, Any]) -> None:
         replay.frames[:, slots] = array(name, np.empty_like(replay.frames[:, slots], order="C"))
     replay.restore(replay_arrays, numbers["replay"])
     array("stacks", run.stacks.frames)
+    run.recording = array("recording") if "recording.npy" in manifest.files else None
+    if run.recording is not None:
+        length, *shape = run.recording.shape
+        if run.recording.dtype != np.uint8 or tuple(shape) != replay.frame_shape or not length:
+            raise ValueError("the recording is not made of frames")
     run.env_thread.submit(run.env.restore, group("env_")).result()
     run.random.bit_generator.state = numbers["random"]
     run.env_steps, run.updates = manifest.env_steps, manifest.updates

@@ -40,7 +40,7 @@ class Loop(types.ModuleType):
         self.calls.append((config, out))
         self.resumed.append(resume)
         (pathlib.Path(out) / "metrics.jsonl").touch()
-        return types.SimpleNamespace(env_steps=0, updates=0, interrupted=False, pictures={})
+        return types.SimpleNamespace(env_steps=0, updates=0, interrupted=False, pictures={}, recording=None)
 
 
 def test_seeds_get_a_run_directory_each(loop, tmp_path, monkeypatch):
@@ -385,7 +385,7 @@ def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkey
         with pytest.raises(KeyboardInterrupt):  # the second one does not wait
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(10)
-        return types.SimpleNamespace(env_steps=40, updates=0, interrupted=True, pictures={})
+        return types.SimpleNamespace(env_steps=40, updates=0, interrupted=True, pictures={}, recording=None)
 
     monkeypatch.setattr(loop, "train", stopped)
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]

@@ -1,6 +1,7 @@
 """Tests of srl_jax.config and of srl_jax.modes, which a config is checked against."""
 
 import dataclasses
+import datetime
 import json
 import os
 import subprocess
@@ -157,6 +158,7 @@ def test_save_and_load(tmp_path):
     saved = json.loads((tmp_path / "config.json").read_text())
     assert saved["versions"].keys() >= {"python", "platform", "jax", "numpy"}
     assert "git_revision" in saved
+    assert datetime.datetime.fromisoformat(saved["started"]) and saved["cpus"] >= 1
     with pytest.raises(ConfigError, match="not a run directory"):
         Config.load(tmp_path / "nothing")
 

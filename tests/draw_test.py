@@ -3,6 +3,7 @@
 import json
 import os
 
+import numpy as np
 import pytest
 
 from experiments import draw, plots
@@ -57,6 +58,19 @@ def test_what_is_no_metrics_file_is_refused(tmp_path):
     path.write_text("[" * 100_000 + "\n")
     with pytest.raises(ConfigError, match="line 1: nested too deeply"):
         draw.read_rows(path)
+
+
+@pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
+@pytest.mark.parametrize("size, scale", [(42, 2), (84, 1), (200, 1)])
+def test_a_recording_becomes_a_gif_of_the_same_size(tmp_path, size, scale):
+    from PIL import Image
+
+    _write(tmp_path)
+    frames = np.zeros((3, size, size), np.uint8)
+    frames[1, 5] = 255
+    (path,) = draw.draw_run(tmp_path, Config(), recording=frames)
+    with Image.open(path) as image:
+        assert path.name == "play.gif" and image.n_frames == 3 and image.size == (scale * size,) * 2
 
 
 @pytest.mark.skipif(not plots.available(), reason="needs the extra plots")

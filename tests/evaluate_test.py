@@ -98,11 +98,13 @@ def test_an_endless_game_is_cut_with_its_score_as_it_stands():
     assert result.lengths == [4, 4, 1, 4]
 
 
-def test_the_first_game_is_recorded_from_its_first_frame_to_its_last():
-    env = Scripted([[[0.0] * 3, [0.0] * 2], [[0.0]]])
-    result = play(env, games=4, record=True)
+@pytest.mark.parametrize("record", [1, 4, 5, 6, 100])
+def test_games_of_the_first_environment_are_recorded_from_their_first_frame_to_their_last(record):
+    # Two games of it, of three and two steps; it goes on into a third one, which does not count.
+    env = Scripted([[[0.0] * 3, [0.0] * 2], [[0.0] * 4]])
+    result = play(env, games=4, record=record)
     assert result.frames.dtype == np.uint8
-    assert result.frames.ravel().tolist() == [0, 1, 2, 3]
+    assert result.frames.ravel().tolist() == [0, 1, 2, 3, 10, 11, 12][:record]
 
 
 def test_what_the_policy_sees():
@@ -122,7 +124,7 @@ def test_same_seed_same_games():
         return ((frames[:, -1].astype(int).sum((1, 2)) + step) % 3).astype(np.int32)
 
     env = envs.make("CatchDistractor", num_envs=2, seed=0, frame_size=42, sticky_actions=0.0, noop_max=0)
-    options = {"games": 3, "epsilon": 0.0, "max_steps": 40, "record": True}
+    options = {"games": 3, "epsilon": 0.0, "max_steps": 40, "record": 30}
     first, other, again = (evaluate(policy, env, seed=seed, **options) for seed in (5, 6, 5))
     assert (first.returns, first.lengths) == (again.returns, again.lengths)
     np.testing.assert_array_equal(first.frames, again.frames)

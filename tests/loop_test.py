@@ -168,6 +168,14 @@ def test_pictures_show_input_target_and_output(joint):
     assert 0 <= inputs.min() and inputs.max() <= 1
 
 
+def test_the_last_evaluation_was_recorded(joint):
+    path, result = joint
+    last = read_metrics(path / "metrics.jsonl")[-1]
+    # Three games, one in each environment: the first one's frames, and the one that it began with.
+    assert result.recording.dtype == np.uint8
+    assert result.recording.shape == (last["eval/lengths"][0] + 1, 42, 42)
+
+
 def test_an_agent_comes_back_from_its_checkpoint(joint):
     path, _ = joint
     agent, params, manifest = loop.load_agent(path)

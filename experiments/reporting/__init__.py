@@ -1,0 +1,1 @@
+"""The page that `experiments.report` writes: its numbers, its pictures, its HTML."""

@@ -1,0 +1,196 @@
+"""The pictures of a report, in their sections."""
+
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from experiments import collect, diagnostic_plots
+from experiments.collect import RunData
+from experiments.reporting import diagnostics, pictures
+from experiments.reporting.contents import Content, Report, run_name
+from experiments.reporting.markup import Markup, figure, listed, plural, tag
+from srl_jax import statistics
+from srl_jax.data import published
+from srl_jax.errors import ConfigError
+from srl_jax.reading import SETTINGS, parse_json, read_bytes
+
+MEDIA_BYTES = 5_000_000
+"""Of pictures taken from the runs, in all; base64 adds a third."""
+LARGEST_PICTURE, SMALLEST_PICTURE = 400_000, 30_000
+"""Bytes that one of them may have where there are few, and may always have."""
+OWN = ("learning_curve", "losses", "diagnostics", "drift")
+"""Pictures of a run that a report draws itself."""
+
+
+def figures(report: Report) -> Content:
+    """What experiments.figures has drawn, with the title and the question beside it."""
+    found = []
+    for path in sorted((report.root / "figures").glob("*.png")):
+        picture = pictures.taken(path, pictures.LARGEST)
+        about = _beside(path.with_suffix(".json"))
+        title, question = (str(about.get(key) or "") for key in ("title", "question"))
+        name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
+        caption = [tag("strong", name), f" {question}"]
+        found.append(figure(picture.source, caption, name, picture.size))
+    return tag("div", found, class_="grid wide") if found else None
+
+
+def _beside(path: Path) -> dict[str, Any]:
+    try:
+        values = parse_json(read_bytes(path, SETTINGS))
+    except FileNotFoundError:
+        return {}
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"{path}: not JSON: {error}") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{path}: not a JSON object")
+    return values
+
+
+def learning_curves(report: Report) -> Content:
+    """A picture a game; of the baseline and a few arms each, where there are many."""
+    drawn = []
+    for game, comparison in report.comparisons.items():
+        if comparison is None:
+            continue
+        levels = [("random policy, published", x.score) for x in published(game) if x.method == "Random"]
+        arms = [arm for arm in report.arms if arm in comparison.returns]
+        for group in groups(arms, report.baseline):
+            lines = {}
+            for arm in group:
+                found = statistics.curve_interval(comparison.returns[arm])
+                lines[report.arms.index(arm)] = pictures.Curve(comparison.steps, *found)
+            picture = pictures.curves(game, lines, size=(5.4, 3.5), label="mean return", levels=levels)
+            caption = _legend(report, {arm: len(comparison.returns[arm]) for arm in group})
+            drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))
+    if not drawn:
+        return None
+    note = (
+        "Mean evaluation return, and its 95 % interval over seeds, at env steps that all runs of a game have."
+    )
+    return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
+
+
+def groups(arms: Sequence[str], baseline: str | None) -> list[list[str]]:
+    """The arms in groups of at most `pictures.ARMS_A_PICTURE`, the baseline in each."""
+    size = pictures.ARMS_A_PICTURE
+    if len(arms) <= size:
+        return [list(arms)]
+    first = [arm for arm in arms if arm == baseline]
+    others = [arm for arm in arms if arm != baseline]
+    number = -(-len(others) // (size - 1))
+    size = -(-len(others) // number)
+    return [first + others[i : i + size] for i in range(0, len(others), size)]
+
+
+def _legend(report: Report, seeds: dict[str, int]) -> Markup:
+    """Which line is whose; arm -> how many seeds it has."""
+    words = {"-": "solid", "--": "dashed", ":": "dotted"}
+    items = []
+    for arm, number in seeds.items():
+        colour, line = pictures.style(report.arms.index(arm))
+        mark = tag("span", style=f"border-top-color: {colour}; border-top-style: {words[line]}")
+        items.append(tag("li", mark, f"{arm} ({plural(number, 'seed')})"))
+    return tag("ul", items, class_="legend")
+
+
+def playing(report: Report) -> Content:
+    """The last evaluation of each arm's first seed."""
+    if not report.media:
+        return tag("p", "Left out (--no_media).", class_="note")
+    limit = _limit(report)
+    parts: list = []
+    for game in report.games:
+        cells = []
+        for run in _first_runs(report, game):
+            if picture := pictures.taken(run.path / "figures" / "play.gif", limit):
+                caption = [tag("strong", run.arm), f", seed {run.seed}"]
+                cells.append(figure(picture.source, caption, f"{run_name(run)}, playing"))
+        if cells:
+            parts += [tag("h3", game), tag("div", cells, class_="grid play")]
+    note = "The first games of the last evaluation, as the agent sees them."
+    return [tag("p", note, class_="note"), parts] if parts else None
+
+
+def panels(report: Report) -> Content:
+    """What the objectives make of observations, of each arm's first seed."""
+    if not report.media:
+        return tag("p", "Left out (--no_media).", class_="note")
+    limit = _limit(report)
+    parts: list = []
+    for game in report.games:
+        cells = []
+        for run in _first_runs(report, game):
+            for path in _panels(run):
+                picture = pictures.taken(path, limit)
+                caption = [tag("strong", run.arm), f", seed {run.seed}: {path.stem}"]
+                cells.append(figure(picture.source, caption, f"{run_name(run)}: {path.stem}", picture.size))
+        if cells:
+            parts += [tag("h3", game), tag("div", cells, class_="grid media")]
+    note = (
+        "Observations from replay: what went in, what should come out, what came out, and how far off it is."
+    )
+    return [tag("p", note, class_="note"), parts] if parts else None
+
+
+def _first_runs(report: Report, game: str) -> list[RunData]:
+    """The first seed of each arm."""
+    return [runs[0] for arm in report.arms if (runs := report.of(game, arm))]
+
+
+def _panels(run: RunData) -> list[Path]:
+    found = sorted((run.path / "figures").glob("*.png"))
+    return [path for path in found if path.stem not in OWN]
+
+
+def _limit(report: Report) -> int:
+    """Bytes that a picture of a run may have, so that all of them are not too large together."""
+    runs = [run for game in report.games for run in _first_runs(report, game)]
+    count = sum(1 + len(_panels(run)) for run in runs)
+    return min(max(MEDIA_BYTES // max(count, 1), SMALLEST_PICTURE), LARGEST_PICTURE)
+
+
+def diagnostic_pictures(report: Report) -> Content:
+    """A small picture for each number, a line an arm; drift as a picture of the first seed."""
+    without = diagnostics.missing(report.runs)
+    evaluated = [run for run in report.runs if len(collect.steps_and_returns(run)[0])]
+    if not any(diagnostics.keys_of([run]) for run in report.runs):
+        return (
+            tag("p", "These runs have no diagnostics: they are of before there were any.")
+            if evaluated
+            else None
+        )
+    parts: list = []
+    for game in report.games:
+        found = diagnostics.panels(report.of(game), report.arms)
+        if not found:
+            continue
+        cells = [
+            figure(panel.picture.source, panel.meaning, f"{game}: {panel.title}", panel.picture.size)
+            for panel in found
+        ]
+        having = {run.arm for run in report.of(game) if diagnostics.keys_of([run])}
+        seeds = {arm: len(report.of(game, arm)) for arm in report.arms if arm in having}
+        parts += [tag("h3", game), _legend(report, seeds), tag("div", cells, class_="grid small")]
+        parts.append(_drift(report, game))
+    if without:
+        parts.append(tag("p", f"Without diagnostics: {listed(map(run_name, without))}.", class_="note"))
+    note = "Measured at every evaluation; means and 95 % intervals over seeds."
+    return [tag("p", note, class_="note"), *parts]
+
+
+def _drift(report: Report, game: str) -> Content:
+    """The error of each epoch's decoder on each epoch's encoder, of each arm's first seed."""
+    found = []
+    for run in _first_runs(report, game):
+        picture = pictures.drawn(functools.partial(diagnostic_plots.drift_matrix, run.rows, title=""))
+        if picture is not None:
+            caption = [
+                tag("strong", run.arm),
+                f", seed {run.seed}: each epoch's decoder on each epoch's encoder",
+            ]
+            found.append(figure(picture.source, caption, f"{run_name(run)}: drift", picture.size))
+    return tag("div", found, class_="grid media") if found else None

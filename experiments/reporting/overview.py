@@ -1,0 +1,158 @@
+"""The head of a report: what was run, and what its numbers say."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from experiments import collect
+from experiments.reporting import configs, numbers
+from experiments.reporting.configs import About
+from experiments.reporting.contents import Content, Report, limits, run_name, side
+from experiments.reporting.markup import Markup, details, listed, number, plural, table, tag
+from experiments.reporting.tables import interval_of, summary_of
+from srl_jax.statistics import Interval
+
+FEW = 10
+"""Seeds below which intervals are too narrow for comfort."""
+
+
+def what_was_run(report: Report) -> Content:
+    """Games, arms, seeds, env steps, revisions, when, on what; runs that have not ended, by name."""
+    abouts = [configs.about(run) for run in report.runs]
+    ended = [numbers.finished(run) for run in report.runs]
+    planned = sorted({run.config.steps for run in report.runs})
+    total = sum(numbers.reached_step(run) for run in report.runs)
+    began = sorted({about.started for about in abouts if about.started})
+    revisions = sorted({_short(about) for about in abouts})
+    facts = [
+        ("Games", ", ".join(report.games)),
+        ("Arms", [[", " if i else "", tag("span", arm, class_="name")] for i, arm in enumerate(report.arms)]),
+        ("Seeds", _seeds(report)),
+        ("Env steps", f"{listed(f'{n:,}' for n in planned)} a run; {total:,} in all"),
+        ("Complete", f"{sum(ended)} of {plural(len(ended), 'run')}"),
+        ("Compared with", report.baseline or "nothing: no arm has a policy"),
+        ("Begun (UTC)", " to ".join(dict.fromkeys([began[0], began[-1]])) if began else "not recorded"),
+        ("Revisions", [[", " if i else "", tag("code", name)] for i, name in enumerate(revisions)]),
+        ("Machine", _machine(abouts)),
+        ("Directory", tag("code", report.root.absolute().name)),
+    ]
+    parts: list = [tag("dl", [[tag("dt", name), tag("dd", value)] for name, value in facts])]
+    if left := [run for run, done in zip(report.runs, ended, strict=True) if not done]:
+        items = [
+            tag("li", f"{run_name(run)}: {numbers.reached_step(run):,} of {run.config.steps:,} env steps")
+            for run in left
+        ]
+        how = "not compared" if report.finished_only else "compared as far as they have got"
+        parts.append(tag("div", tag("strong", f"Not finished, {how}:"), tag("ul", items), class_="warn"))
+    if len(revisions) > 1:
+        parts.append(tag("p", "The runs are of several revisions of the code.", class_="note"))
+    parts.append(details("Every run", _all_runs(report, abouts)))
+    versions = sorted({f"{name} {version}" for about in abouts for name, version in about.versions})
+    if versions:
+        parts.append(details("Versions", tag("p", ", ".join(versions), class_="note")))
+    return parts
+
+
+def _short(about: About) -> str:
+    name, _, dirty = about.revision.partition("-")
+    return name[:10] + ("-dirty" if dirty else "") or "not recorded"
+
+
+def _seeds(report: Report) -> str:
+    counts = {len(report.of(game, arm)) for game in report.games for arm in report.arms} - {0}
+    seeds = sorted({run.seed for run in report.runs})
+    each = " to ".join(map(str, sorted({min(counts), max(counts)})))
+    return f"{each} of each arm on a game ({', '.join(map(str, seeds))})"
+
+
+def _machine(abouts: Sequence[About]) -> str:
+    found = set()
+    for about in abouts:
+        versions = dict(about.versions)
+        parts = [versions.get("platform", ""), f"{about.cpus} CPUs" if about.cpus else ""]
+        parts += [f"{name} {versions[name]}" for name in ("python", "jax") if name in versions]
+        found.add(", ".join(filter(None, parts)))
+    return "; ".join(sorted(found - {""})) or "not recorded"
+
+
+def _all_runs(report: Report, abouts: Sequence[About]) -> Markup:
+    rows = []
+    for run, about in zip(report.runs, abouts, strict=True):
+        steps, returns = collect.steps_and_returns(run)
+        last = f"{number(float(returns[-1]))} at {steps[-1]:,}" if len(steps) else "–"
+        cells = [run_name(run), f"{numbers.reached_step(run):,} of {run.config.steps:,}"]
+        cells += ["yes" if numbers.finished(run) else "no", len(steps), last, _short(about)]
+        cells += [about.started or "–", tag("code", run.path.relative_to(report.root))]
+        rows.append(cells)
+    head = ("run", "env steps", "finished", "evaluations", "last return", "revision", "begun", "directory")
+    return table(head, rows, "Every run")
+
+
+def what_it_says(report: Report) -> Content:
+    """The comparison in sentences: only what follows from an interval."""
+    parts: list = []
+    for game, comparison in report.comparisons.items():
+        rows = {row.arm: row for row in report.rows if row.game == game}
+        base = rows.pop(report.baseline, None)
+        if comparison is None or base is None or not rows:
+            continue
+        counts = sorted({row.seeds for row in [base, *rows.values()]})
+        many = f"{listed(counts)} seed{'' if counts == [1] else 's'} an arm"
+        parts.append(tag("p", tag("strong", game), f", {int(comparison.steps[-1]):,} env steps, {many}:"))
+        items = []
+        for what, of in (("Return at the end", "final"), ("Return averaged over env steps", "area")):
+            found = {arm: getattr(row, f"{of}_difference") for arm, row in rows.items()}
+            items.append(_sentence(report, what, getattr(base, of), found))
+        parts.append(tag("ul", items))
+    parts += _over_games(report)
+    if not parts:
+        return None
+    if max((row.seeds for row in report.rows), default=0) < FEW:
+        note = (
+            "Intervals are 95 % stratified-bootstrap intervals over seeds. With so few seeds they are too "
+            "narrow, and among many comparisons some leave 0 out by chance: read a difference that only "
+            "just does as a hint."
+        )
+        parts.append(tag("p", note, class_="note"))
+    return parts
+
+
+def _over_games(report: Report) -> list:
+    """The interquartile mean of human-normalised scores, where there are several games."""
+    if sum(comparison is not None for comparison in report.comparisons.values()) < 2:
+        return []
+    items = []
+    for what, of in (("At the end", "final"), ("Averaged over env steps", "area")):
+        rows = [row for row in summary_of(report, of) if row["game"] is None]
+        own = [row for row in rows if row["statistic"] == "interquartile_mean"]
+        base = [interval_of(row) for row in own if row["arm"] == report.baseline]
+        found = {
+            row["arm"]: interval_of(row)
+            for row in rows
+            if row["statistic"] == "interquartile_mean_difference"
+        }
+        if base and found:
+            items.append(_sentence(report, what, base[0], found))
+    title = tag("p", tag("strong", "Over games"), ", interquartile mean of human-normalised returns:")
+    return [title, tag("ul", items)] if items else []
+
+
+def _sentence(report: Report, what: str, base: Interval, differences: dict[str, Interval | None]) -> Markup:
+    """What the baseline has, and the arms whose difference from it has an interval without 0."""
+    known = {arm: x for arm, x in differences.items() if x is not None and not np.isnan(x.low)}
+    clear = [
+        f"{arm}, {number(abs(float(x.point)))} {'above' if side(x) > 0 else 'below'} {limits(x)}"
+        for arm, x in known.items()
+        if side(x)
+    ]
+    text = f"{what}: {report.baseline} has {number(float(base.point))} {limits(base)}. "
+    if clear:
+        text += f"Different from it, by an interval that excludes 0: {'; '.join(clear)}. "
+        text += "All other intervals contain 0. " if len(clear) < len(known) else ""
+    elif known:
+        text += "No arm differs from it by an interval that excludes 0. "
+    if unknown := len(differences) - len(known):
+        text += (
+            f"{plural(unknown, 'arm')} without an interval: one seed cannot tell a difference from chance."
+        )
+    return tag("li", text.strip())

@@ -1,0 +1,209 @@
+"""Pictures as data URIs: drawn here, or taken from the runs and made smaller where need be."""
+
+import base64
+import io
+import struct
+import tempfile
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from experiments import plots
+from srl_jax import statistics
+from srl_jax.errors import ConfigError
+from srl_jax.reading import read_bytes
+
+LARGEST = 1 << 24
+"""Bytes that a picture on disk may have."""
+STYLES = ("-", "--", ":")
+"""Of lines, once all colours are taken."""
+ARMS_A_PICTURE = 6
+"""Lines of arms that can be told apart in one picture of learning curves."""
+
+
+class Picture(NamedTuple):
+    """A picture within a page.
+
+    Attributes:
+        source: a data URI.
+        size: width and height in pixels.
+        bytes: of the file.
+    """
+
+    source: str
+    size: tuple[int, int]
+    bytes: int
+
+
+class Curve(NamedTuple):
+    """One line of a small picture: float64 [points] each; low and high are NaN where there is no interval."""
+
+    steps: np.ndarray
+    point: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def style(index: int) -> tuple[str, str]:
+    """The colour and the line of an arm by its place."""
+    number = len(plots.COLOURS)
+    return plots.COLOURS[index % number], STYLES[index // number % len(STYLES)]
+
+
+def drawn(draw: Callable[[Path], object]) -> Picture | None:
+    """What a function of the path of a PNG file draws; None where it writes nothing."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        draw(path)
+        return picture(path.read_bytes(), str(path)) if path.exists() else None
+
+
+def picture(data: bytes, name: str) -> Picture:
+    """A PNG, JPEG or GIF as it is.
+
+    Raises:
+        ConfigError: it is none; `name` is the file's.
+    """
+    kind, size = _form(data)
+    if kind is None:
+        raise ConfigError(f"{name}: neither a PNG nor a GIF")
+    return Picture(f"data:image/{kind};base64,{base64.b64encode(data).decode()}", size, len(data))
+
+
+def _form(data: bytes) -> tuple[str | None, tuple[int, int] | None]:
+    if data[:8] == b"\x89PNG\r\n\x1a\n" and len(data) >= 24:
+        return "png", struct.unpack(">II", data[16:24])
+    if data[:6] in (b"GIF87a", b"GIF89a") and len(data) >= 10:
+        return "gif", struct.unpack("<HH", data[6:10])
+    return None, None
+
+
+def taken(path: Path, limit: int) -> Picture | None:
+    """A picture of a run, made smaller where it has more bytes than the limit; None where there is none.
+
+    A GIF loses frames, and plays as fast as before; a PNG becomes a JPEG.
+
+    Raises:
+        ConfigError: it cannot be read, or is no picture.
+    """
+    try:
+        data = read_bytes(path, LARGEST)
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    found = picture(data, str(path))
+    if found.bytes <= limit:
+        return found
+    from PIL import Image
+
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG", "GIF")) as image:
+            if image.format == "GIF":
+                return picture(_smaller_gif(image, limit), str(path))
+            return _as_jpeg(image, found.size)
+    except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError) as error:
+        raise ConfigError(f"{path}: not a picture: {error}") from None
+
+
+def _smaller_gif(image, limit: int) -> bytes:
+    """Without what scaling up has added, then with every second frame, then without the last ones."""
+    frames, durations = [], []
+    for i in range(image.n_frames):
+        image.seek(i)
+        frames.append(np.asarray(image.convert("L")))
+        durations.append(image.info.get("duration", 70))
+    stack = np.stack(frames)
+    while not any(n % 2 for n in stack.shape[1:]) and _doubled(stack):
+        stack = stack[:, ::2, ::2]
+    data = _gif(stack, durations)
+    if len(data) > limit and len(stack) > 1:
+        durations = [sum(durations[i : i + 2]) for i in range(0, len(stack), 2)]
+        stack = stack[::2]
+        data = _gif(stack, durations)
+    while len(data) > limit and len(stack) > 1:
+        kept = max(1, min(len(stack) - 1, int(len(stack) * limit / len(data))))
+        stack, durations = stack[:kept], durations[:kept]
+        data = _gif(stack, durations)
+    return data
+
+
+def _doubled(stack: np.ndarray) -> bool:
+    half = stack[:, ::2, ::2]
+    return np.array_equal(stack, half.repeat(2, axis=1).repeat(2, axis=2))
+
+
+def _gif(stack: np.ndarray, durations: list[int]) -> bytes:
+    from PIL import Image
+
+    first, *others = [Image.fromarray(frame) for frame in stack]
+    file = io.BytesIO()
+    first.save(file, format="GIF", save_all=True, append_images=others, loop=0, duration=durations)
+    return file.getvalue()
+
+
+def _as_jpeg(image, size: tuple[int, int]) -> Picture:
+    file = io.BytesIO()
+    image.convert("RGB").save(file, format="JPEG", quality=75, optimize=True)
+    data = file.getvalue()
+    return Picture(f"data:image/jpeg;base64,{base64.b64encode(data).decode()}", size, len(data))
+
+
+def interval_curves(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
+    """The mean of several runs' curves and its interval, at steps that all have; None without such."""
+    kept = [(steps, values) for steps, values in runs if len(steps)]
+    if not kept:
+        return None
+    try:
+        steps, values = statistics.at_equal_steps(kept)
+    except ValueError:
+        return None
+    return Curve(steps, *statistics.curve_interval(values))
+
+
+def curves(
+    title: str,
+    lines: Mapping[int, Curve],
+    *,
+    size: tuple[float, float] = (3.4, 2.3),
+    label: str = "",
+    levels: Sequence[tuple[str, float]] = (),
+) -> Picture:
+    """A picture of one number against env steps; which line is whose is said beside it.
+
+    Args:
+        title: above it.
+        lines: the arm's place, which gives its style -> its curve.
+        size: width and height in inches.
+        label: of the vertical axis.
+        levels: names and heights of dotted lines across.
+    """
+    small = size[0] < 4
+
+    def draw(path: Path) -> None:
+        figure = plots._figure(*size)
+        axes = figure.add_subplot()
+        for place, curve in lines.items():
+            colour, line = style(place)
+            if np.isfinite(curve.low).any():
+                axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
+            width, marker = 1.5 if small else 1.8, "o" if len(curve.steps) == 1 else ""
+            axes.plot(
+                curve.steps, curve.point, line, color=colour, linewidth=width, marker=marker, markersize=3
+            )
+        for name, height in levels:
+            axes.axhline(height, color="#888888", linestyle=":", linewidth=1)
+            axes.annotate(
+                name, (0.01, height), xycoords=axes.get_yaxis_transform(), xytext=(0, 1.5),
+                textcoords="offset points", fontsize=7, color="#555555", parse_math=False,
+            )  # fmt: skip
+        axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
+        plots._count_axis(axes)
+        axes.tick_params(labelsize=7 if small else 9)
+        axes.set_xlabel(plots.STEPS_LABEL, fontsize=7.5 if small else 9)
+        axes.set_ylabel(label, fontsize=9)
+        plots._save(figure, path)
+
+    return drawn(draw)
