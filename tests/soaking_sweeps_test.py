@@ -37,7 +37,7 @@ def test_equal_sweeps_are_equal_and_differences_are_found(pair, capsys):
     assert failed(pair) == 1 and f"{A}: metrics.jsonl differs" in capsys.readouterr().out
     with open(pair[1] / "logs" / f"{B}.log", "a") as log:
         log.write(f"500 env steps, 1 updates; everything is in {B}\n")
-    assert failed(pair) == 2 and f"{B}: complete 2 times" in capsys.readouterr().out
+    assert failed(pair) == 2 and f"{B}: run to its end 2 times" in capsys.readouterr().out
     (pair[1] / f"{B}.broken-1").mkdir()
     assert failed(pair) == 3
     (pair[1] / B / "checkpoints/000000500/params.msgpack").unlink()

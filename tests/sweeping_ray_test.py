@@ -69,6 +69,15 @@ def test_without_ray_one_line_says_what_to_install(tmp_path, monkeypatch):
     assert not stubs.root.exists()
 
 
+@pytest.mark.parametrize("address", ["localhost:1", "nowhere", "localhost:x", "localhost:99999999"])
+def test_an_address_where_nobody_listens_is_refused_at_once(tmp_path, monkeypatch, address):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
+    stubs = Sweep(tmp_path / "new")
+    with pytest.raises(ConfigError, match=f"--ray_address={address}: no Ray cluster: "):
+        stubs.run(launcher="ray", ray_address=address)
+    assert not stubs.root.exists()
+
+
 def test_the_task_needs_nothing_but_its_texts(tmp_path):
     """A worker does not have the checkout on its path: the function that travels puts it there."""
     module = tmp_path / "experiments" / "sweeping" / "ray_launcher.py"

@@ -169,12 +169,16 @@ def differing(alone: Path, other: Path, name: str) -> list[str]:
     config = manifest.read(other)[name].config
     if states.look(other / name, config).kind != "done":
         found.append("not complete")
-    if (times := ends(other, name)) != 1:
-        found.append(f"complete {times} times")
+    if (times := ends(other, name)) > 1:
+        found.append(f"run to its end {times} times")
     return found
 
 
 def ends(root: Path, name: str) -> int:
-    """How often a run has come to its end, as its log has it."""
+    """How often a run has said that it has come to its end.
+
+    That is the last thing that it does: one that was killed between its last checkpoint and that line is
+    complete, and says nothing.
+    """
     text = states.log_path(root, name).read_text(encoding="utf-8", errors="replace")
     return text.count("everything is in ")

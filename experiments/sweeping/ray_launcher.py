@@ -11,6 +11,7 @@ have such locks, as NFS 4 does; there, those of a node that is lost go when its 
 import importlib.util
 import os
 import signal
+import socket
 import time
 import uuid
 from collections.abc import Callable
@@ -62,6 +63,7 @@ class Ray:
     ):
         if importlib.util.find_spec("ray") is None:
             raise ConfigError("--launcher=ray: needs Ray, pip install 'srl-jax[ray]'")
+        _check_address(address)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         import ray
@@ -144,6 +146,22 @@ class Ray:
     def close(self) -> None:
         self.stop_file.unlink(missing_ok=True)
         self.ray.shutdown()
+
+
+def _check_address(address: str | None) -> None:
+    """Whether somebody listens at HOST:PORT: Ray itself would try for a quarter of an hour.
+
+    Raises:
+        ConfigError: nobody does.
+    """
+    if address is None or address == "auto" or "://" in address:
+        return
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=10).close()
+    except (OSError, ValueError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"--ray_address={address}: no Ray cluster: {why}; give HOST:PORT or auto") from None
 
 
 def _task() -> Callable[..., dict]:
