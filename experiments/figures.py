@@ -250,6 +250,8 @@ def run(values: flags.FlagValues) -> int:
     try:
         if not values["redraw"].value:
             status = sweep.run_sweep(root, runs, **options).status
+            if status >= 128:  # told to end
+                return status
         here = [root / run.name for run in runs if (root / run.name / "config.json").exists()]
         read = [collect.load_run(path) for path in here]
         for figure in figures:

@@ -31,6 +31,8 @@ PARTS = {
     "machine": "replay does what an obvious reference does",
     "memory": "resident memory does not grow once the buffer is full",
     "cost": "checkpoints and going on are cheap",
+    "sweeps": "a killed sweep, started again, ends with the same figures",
+    "cluster": "a sweep on a Ray cluster survives the loss of workers and of a node",
 }
 """{module of `experiments.soaking`: what it tries to break}, in the order in which they run."""
 

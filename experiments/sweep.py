@@ -158,20 +158,20 @@ def run_sweep(
     chosen = check(root, runs, resolve)
     root = root.absolute()
     rundir.check_free(root)
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise ConfigError(f"--out={root}: {error.strerror}") from None
-    with rundir.held(root):
-        manifest.write(root, manifest.read(root) | chosen)
-        executor: Launcher
-        if launcher == "ray":
-            from experiments.sweeping.ray_launcher import Ray
+    executor: Launcher
+    if launcher == "ray":
+        from experiments.sweeping.ray_launcher import Ray
 
-            executor = Ray(root, workers, cpus_per_run, gpus_per_run, retries, ray_address, command)
-        else:
-            executor = local.Local(root, workers, cpus_per_run, command)
-        with contextlib.closing(executor):
+        executor = Ray(root, workers, cpus_per_run, gpus_per_run, retries, ray_address, command)
+    else:
+        executor = local.Local(root, workers, cpus_per_run, command)
+    with contextlib.closing(executor):
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise ConfigError(f"--out={root}: {error.strerror}") from None
+        with rundir.held(root):
+            manifest.write(root, manifest.read(root) | chosen)
             screen = table.Screen(root, chosen, executor.workers)
             screen.note(f"{len(chosen)} runs in {root}, {executor.where}")
             return launching.launch(root, chosen, executor, screen, retries=retries)

@@ -1,5 +1,6 @@
 """One attempt at a run: a process with the run's command line, its log and its record. Imports no jax."""
 
+import contextlib
 import os
 import signal
 import subprocess
@@ -27,7 +28,7 @@ class Attempt:
         cores: how many it keeps to.
 
     Raises:
-        SaveError: log or record cannot be written.
+        SaveError: its log cannot be written.
     """
 
     def __init__(self, root: Path, name: str, command: list[str], cores: int = 1):
@@ -59,7 +60,7 @@ class Attempt:
         self.record = Record(
             states.host(), self.process.pid, self.cores.numbers, attempts, round(time.time(), 3)
         )
-        states.write_record(root, name, self.record)
+        self._write_record()
 
     def poll(self) -> Record | None:
         """The record once the process has ended, which is then written; None before."""
@@ -69,8 +70,13 @@ class Attempt:
         self.cores.give_back()
         reason = "" if status == 0 or self.stopped else self._reason(status)
         self.record = self.record._replace(ended=round(time.time(), 3), status=status, reason=reason)
-        states.write_record(self.root, self.name, self.record)
+        self._write_record()
         return self.record
+
+    def _write_record(self) -> None:
+        # A record informs and decides nothing: a full disk, the run itself reports.
+        with contextlib.suppress(SaveError):
+            states.write_record(self.root, self.name, self.record)
 
     def _reason(self, status: int) -> str:
         if status < 0:

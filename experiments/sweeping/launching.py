@@ -6,7 +6,6 @@ Where runs are executed is a `Launcher`'s: processes of this machine (`local`), 
 
 import contextlib
 import signal
-import sys
 import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
@@ -16,7 +15,7 @@ from typing import Any, NamedTuple, Protocol
 from experiments.sweeping import attempt, states
 from experiments.sweeping.manifest import Entry
 from srl_jax.config import Config
-from srl_jax.errors import SaveError
+from srl_jax.errors import ConfigError, SaveError
 
 
 class Ended(NamedTuple):
@@ -151,7 +150,7 @@ def launch(
 
     Raises:
         SaveError: nothing more can be written; what ran has been stopped.
-        ConfigError: a directory holds a run of another configuration.
+        ConfigError: a directory holds a run of another configuration; nothing was started.
     """
     sweep = _Sweep(root, entries, launcher, screen, retries)
     with signals() as caught:
@@ -175,7 +174,7 @@ def launch(
     screen.update(sweep.view(), final=True)
     if sweep.disk:
         raise SaveError(sweep.disk)
-    return Outcome(sweep.done, sweep.failed, sweep.blocked, caught[0] if caught else 0)
+    return Outcome(list(sweep.done), sweep.failed, sweep.blocked, caught[0] if caught else 0)
 
 
 class _Sweep:
@@ -186,7 +185,7 @@ class _Sweep:
         self.retries = retries
         self.waiting = dict.fromkeys(entries, "")
         self.running: list[str] = []
-        self.done: list[str] = []
+        self.done: dict[str, None] = {}
         self.failed: dict[str, str] = {}
         self.blocked: dict[str, str] = {}
         self.attempts: dict[str, int] = {}
@@ -195,7 +194,7 @@ class _Sweep:
         for name, state in look_at_all(root, entries).items():
             if state.kind == "done":
                 self.waiting.pop(name)
-                self.done.append(name)
+                self.done[name] = None
 
     @property
     def over(self) -> bool:
@@ -217,11 +216,10 @@ class _Sweep:
         for name, status, reason, again in self.launcher.ended():
             self.running.remove(name)
             if status == 0:
-                state = states.look(self.root / name, self.entries[name].config)
-                if state.kind == "done":
-                    self.done.append(name)
+                reason, again = self.why_not_done(name), False
+                if not reason:
+                    self.done[name] = None
                     continue
-                reason, again = f"ended with status 0 and is {state.kind}: {state.reason}", False
             if self.stopping:
                 self.waiting[name] = "stopped"
             elif status == attempt.NO_SPACE:
@@ -234,6 +232,16 @@ class _Sweep:
             else:
                 self.failed[name] = reason
                 self.screen.note(f"{name}: failed: {reason}")
+
+    def why_not_done(self, name: str) -> str:
+        """Why a run that has ended well is not complete; "" if it is."""
+        try:
+            state = states.look(self.root / name, self.entries[name].config)
+        except ConfigError as error:  # other code was run than this process has
+            return str(error)
+        if state.kind == "done":
+            return ""
+        return f"ended with status 0 and is {state.kind} {state.reason}".rstrip()
 
     def start_next(self) -> None:
         now = time.monotonic()
@@ -248,14 +256,20 @@ class _Sweep:
                 continue
             if now < self.ask_again.get(name, 0.0) or not self.launcher.room(entry.config):
                 continue
-            state = states.prepare(self.root / name, entry.config, self.screen.note)
+            try:
+                state = states.prepare(self.root / name, entry.config, self.screen.note)
+            except ConfigError as error:  # it was as it should be when the sweep began; the others may go on
+                del self.waiting[name]
+                self.failed[name] = str(error)
+                self.screen.note(f"{name}: failed: {error}")
+                continue
             if state.kind == "busy":
-                self.ask_again[name] = now + 2.0
+                self.ask_again[name] = now + 1.0
                 self.waiting[name] = state.reason
                 continue
             del self.waiting[name]
             if state.kind == "done":  # another process has ended it
-                self.done.append(name)
+                self.done[name] = None
                 continue
             self.launcher.start(entry)
             self.attempts[name] = self.attempts.get(name, 0) + 1
@@ -282,8 +296,3 @@ def check_order(entries: Sequence[Entry]) -> None:
         if missing := [name for name in entry.run.sources if name not in seen]:
             raise ValueError(f"{entry.run.name} comes before {missing[0]}, from which it starts")
         seen.add(entry.run.name)
-
-
-def say(text: str) -> None:
-    """A line for whoever watches, on stderr."""
-    print(f"sweep: {text}", file=sys.stderr, flush=True)

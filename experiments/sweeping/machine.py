@@ -6,6 +6,7 @@ import os
 import random
 import sys
 import tempfile
+from collections import Counter
 from pathlib import Path
 
 from experiments import runtime
@@ -51,6 +52,9 @@ def most_workers() -> int:
     return 1 if has_gpu() else runtime.cores()
 
 
+_lent: Counter[int] = Counter()  # how many runs of this process are on a core
+
+
 class Lent:
     """Cores that are a run's until they are given back, or the process that took them ends.
 
@@ -58,18 +62,22 @@ class Lent:
     """
 
     def __init__(self, numbers: tuple[int, ...], descriptors: list[int]):
-        self.numbers, self._descriptors = numbers, descriptors
+        self.numbers, self._descriptors, self._given_back = numbers, descriptors, False
+        _lent.update(numbers)
 
     def give_back(self) -> None:
         """A second call does nothing."""
+        if not self._given_back:
+            _lent.subtract(self.numbers)
+        self._given_back = True
         while self._descriptors:
             os.close(self._descriptors.pop())
 
 
 def lend(count: int, folder: Path | None = None) -> Lent:
-    """So many cores that no run has, and shared ones where there are too few.
+    """So many cores that no run has, and where there are too few, those with the fewest runs of this process.
 
-    None where there is nothing to choose: on a GPU, or on a system without affinity.
+    None at all where there is nothing to choose: on a GPU, or on a system without affinity.
 
     Args:
         count: how many; at least 1.
@@ -100,6 +108,6 @@ def lend(count: int, folder: Path | None = None) -> Lent:
         taken.append(core)
         descriptors.append(descriptor)
     # More runs than cores: they share, but each with as many as it has alone, so that XLA computes alike.
-    others = [core for core in free if core not in taken]
-    taken += random.sample(others, min(count, len(free)) - len(taken))
+    others = sorted((core for core in free if core not in taken), key=lambda x: (_lent[x], random.random()))
+    taken += others[: min(count, len(free)) - len(taken)]
     return Lent(tuple(sorted(taken)), descriptors)

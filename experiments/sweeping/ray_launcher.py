@@ -3,14 +3,15 @@
 A task gets texts and returns a small dict; everything else goes by way of the sweep's directory, which every
 node sees under the same path, as it does the checkout and the interpreter. Of Ray it takes tasks, resources
 and retries: when a worker or its node is lost, Ray starts the task again elsewhere, and the run goes on from
-its own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a task that
-is started again waits until the run's former process has ended. A file system that nodes share has to
+its own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a task
+that is started again waits until the run's former process has ended. A file system that nodes share has to
 have such locks, as NFS 4 does; there, those of a node that is lost go when its lease ends.
 """
 
 import importlib.util
 import os
 import signal
+import socket
 import time
 import uuid
 from collections.abc import Callable
@@ -62,6 +63,7 @@ class Ray:
     ):
         if importlib.util.find_spec("ray") is None:
             raise ConfigError("--launcher=ray: needs Ray, pip install 'srl-jax[ray]'")
+        _check_address(address)
         os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
         os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
         import ray
@@ -81,6 +83,7 @@ class Ray:
         )
         self.flying: dict[Any, str] = {}
         self.stops = 0
+        self.asked_at, self.most = float("-inf"), 1
         self.stop_file = root / "state" / f"stop-{uuid.uuid4().hex}"
         if not self.capacity():
             raise ConfigError(
@@ -92,7 +95,11 @@ class Ray:
     @property
     def workers(self) -> int:
         """Runs at once; it changes where nodes come and go."""
-        return self.given or max(self.capacity(), 1)
+        if self.given:
+            return self.given
+        if time.monotonic() - self.asked_at > 5.0:
+            self.asked_at, self.most = time.monotonic(), max(self.capacity(), 1)
+        return self.most
 
     def nodes(self) -> list[dict]:
         """Resources of the nodes that are alive."""
@@ -131,14 +138,30 @@ class Ray:
         return found
 
     def stop(self) -> None:
-        # A file, which tasks look for: Ray's way to cancel one is Ctrl-C, to which a sweep that was started in
-        # the background of a script is deaf, and its workers are, too.
+        # A file, which tasks look for: Ray's way to cancel one is Ctrl-C, to which a sweep that a script has
+        # started in the background is deaf, and its workers are, too.
         self.stops += 1
         manifest.replace(self.stop_file, f"{self.stops}\n")
 
     def close(self) -> None:
         self.stop_file.unlink(missing_ok=True)
         self.ray.shutdown()
+
+
+def _check_address(address: str | None) -> None:
+    """Whether somebody listens at HOST:PORT: Ray itself would try for a quarter of an hour.
+
+    Raises:
+        ConfigError: nobody does.
+    """
+    if address is None or address == "auto" or "://" in address:
+        return
+    host, _, port = address.rpartition(":")
+    try:
+        socket.create_connection((host, int(port)), timeout=10).close()
+    except (OSError, ValueError, OverflowError) as error:
+        why = getattr(error, "strerror", None) or error
+        raise ConfigError(f"--ray_address={address}: no Ray cluster: {why}; give HOST:PORT or auto") from None
 
 
 def _task() -> Callable[..., dict]:

@@ -45,17 +45,17 @@ class Speed(NamedTuple):
     source: str
 
 
-def last_rows(path: Path) -> list[dict[str, Any]]:
-    """The last rows of a metrics.jsonl, read from its end; none where there is none."""
+def last_rows(path: Path, tail: int = TAIL) -> list[dict[str, Any]]:
+    """The rows in the last so many bytes of a metrics.jsonl; none where there is none."""
     try:
         with open(path, "rb") as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(size - TAIL, 0))
+            file.seek(max(size - tail, 0))
             lines = file.read().split(b"\n")
     except OSError:
         return []
     rows = []
-    for line in lines[int(size > TAIL) : -1]:
+    for line in lines[int(size > tail) : -1]:
         try:
             row = json.loads(line)
             if isinstance(row, dict) and type(row["env_steps"]) is int and row["wall_s"] >= 0:
@@ -65,9 +65,9 @@ def last_rows(path: Path) -> list[dict[str, Any]]:
     return rows
 
 
-def progress(run: Path) -> Progress:
-    """How far the run in a directory is, from its last rows."""
-    rows = last_rows(run / "metrics.jsonl")
+def progress(run: Path, tail: int = TAIL) -> Progress:
+    """How far the run in a directory is, from its last rows: those in so many bytes."""
+    rows = last_rows(run / "metrics.jsonl", tail)
     if not rows:
         return Progress()
     returns = [row.get("eval/return_mean") for row in rows if row.get("kind") == "eval"]
@@ -117,7 +117,7 @@ class Speeds:
         """{key: (env steps, seconds)}, summed over the runs."""
         table: dict[tuple, tuple[float, float]] = defaultdict(lambda: (0.0, 0.0))
         for path, config in runs:
-            got = progress(path)
+            got = progress(path, 1 << 15)
             if got.seconds <= 0 or got.env_steps <= 2 * config.learn_start:
                 continue
             for key in keys(config):

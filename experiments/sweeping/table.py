@@ -1,5 +1,6 @@
 """A sweep as text: what runs, where, how far, and what failed and why. Imports no jax."""
 
+import contextlib
 import shutil
 import sys
 import time
@@ -11,7 +12,7 @@ from experiments.sweeping import states
 from experiments.sweeping.launching import View
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.speed import Progress, Speeds, progress, seconds_left
-from srl_jax import rundir
+from srl_jax import checkpoint, rundir
 from srl_jax.errors import ConfigError
 from srl_jax.progress import hms
 
@@ -77,8 +78,8 @@ def table(
 
 
 def where(record: states.Record | None) -> str:
-    """Host and cores of a run."""
-    if record is None:
+    """Host and cores of a run; "" before it has been started there."""
+    if record is None or record.ended is not None:
         return ""
     cores = ",".join(map(str, record.cores))
     return record.host + (f" core {cores}" if cores else "")
@@ -95,11 +96,11 @@ def summary(root: Path, view: View, left: tuple[float, int] | None) -> str:
     parts += [f"{number} {what}" for what, number in counts.items() if number]
     if left is not None and (view.running or view.waiting):
         seconds, unknown = left
-        text = f"{hms(seconds)} left" if unknown < total else "time left unknown"
-        if 0 < unknown < total:
+        text = f"{hms(seconds)} left" if seconds else "time left unknown"
+        if seconds and unknown:
             text += f" and {unknown} of unknown speed"
         parts.append(text)
-    return f"{root}: {', '.join(parts)}"
+    return f"{', '.join(parts)} | {root}"
 
 
 class Screen:
@@ -144,8 +145,7 @@ class Screen:
     def note(self, text: str) -> None:
         """See `launching.Screen`."""
         self._clear()
-        self.stream.write(f"sweep: {text}\n")
-        self.stream.flush()
+        self._write(f"sweep: {text}\n")
         self.drawn_at = float("-inf") if self.tty else self.drawn_at
 
     def _lines(self, view: View, now: float) -> list[str]:
@@ -167,13 +167,17 @@ class Screen:
             size = shutil.get_terminal_size()
             lines = [line[: max(size.columns - 1, 1)] for line in lines[: max(size.lines - 1, 1)]]
             self.drawn = len(lines)
-        self.stream.write("".join(f"{line}\n" for line in lines))
-        self.stream.flush()
+        self._write("".join(f"{line}\n" for line in lines))
 
     def _clear(self) -> None:
         if self.drawn:
-            self.stream.write(f"\x1b[{self.drawn}F\x1b[J")
+            self._write(f"\x1b[{self.drawn}F\x1b[J")
             self.drawn = 0
+
+    def _write(self, text: str) -> None:
+        with contextlib.suppress(OSError):  # nobody reads it any more; the runs go on
+            self.stream.write(text)
+            self.stream.flush()
 
     def _tell_changes(self, view: View) -> None:
         before = self.seen
@@ -184,7 +188,9 @@ class Screen:
         for name in view.done if before else ():
             if name not in before.done:
                 p = progress(self.root / name)
-                steps = states.look(self.root / name, self.entries[name].config).env_steps
+                steps = p.env_steps
+                with contextlib.suppress(ConfigError):  # the last row may be of before the end
+                    steps = checkpoint.read_manifest(self.root / name).env_steps
                 score = "" if p.evaluation is None else f", last evaluation {p.evaluation:.4g}"
                 self.note(f"{name}: done, {steps:,} env steps in {hms(p.seconds)}{score}")
         for name, why in view.blocked.items():

@@ -1,0 +1,116 @@
+"""experiments/sweeping/plan.py, and the configurations that its runs have."""
+
+import pytest
+
+from experiments.presets import PRESETS
+from experiments.sweeping import plan, resolving
+from experiments.sweeping.plan import Arm, Planned, arm_of
+from srl_jax.errors import ConfigError
+
+
+def test_what_a_run_starts_from_is_planned_once_and_before_it():
+    arms = [arm_of("small/frozen_256"), arm_of("small/joint_from_pretrained_256"), arm_of("small/joint_256")]
+    runs = plan.plan(arms, ["Catch"], [0, 1], {"steps": "1000"})
+    names = [run.name.split("/")[1:] for run in runs]
+    one = ["rl_only_nature", "pretrain_256", "frozen_256", "joint_from_pretrained_256", "joint_256"]
+    assert names == [[arm, f"seed{seed}"] for seed in (0, 1) for arm in one]
+    by_name = {run.name: run for run in runs}
+    frozen = by_name["Catch/frozen_256/seed1"]
+    assert frozen.encoder_from == "Catch/pretrain_256/seed1" and frozen.policy_from == ""
+    assert by_name["Catch/pretrain_256/seed1"].policy_from == "Catch/rl_only_nature/seed1"
+    assert frozen.flags == {"game": "Catch", "seed": "1", "steps": "1000"}
+    # Pretraining is 1.5 of the thesis' 5 million env steps.
+    assert by_name["Catch/pretrain_256/seed1"].flags["steps"] == "300"
+    assert by_name["Catch/joint_256/seed0"].sources == []
+
+
+def test_an_arm_may_be_the_source_of_another():
+    arms = [arm_of("small/frozen_256"), Arm("pretrain_256", "small/pretrain_256", {"steps": "77"})]
+    runs = {run.name: run for run in plan.plan(arms, ["Catch"], [3], {"steps": "1e3", "gamma": "0.9"})}
+    assert len(runs) == 3
+    assert runs["Catch/pretrain_256/seed3"].flags == {
+        "game": "Catch", "seed": "3", "steps": "77", "gamma": "0.9",
+    }  # fmt: skip
+    # In another mode it needs no encoder.
+    (alone,) = plan.plan([Arm("a", "small/frozen_256", {"mode": "rl_only"})], [], [0])
+    assert alone == Planned("Pong/a/seed0", "small/frozen_256", alone.flags) or alone.sources == []
+
+
+@pytest.mark.parametrize(
+    "arms, games, flags, says",
+    [
+        ([Arm("a", "small/joint_256"), Arm("a", "small/joint_50")], [], {}, "arm a: there twice"),
+        ([arm_of("small/joint_256"), arm_of("thesis/joint_256")], [], {}, "joint_256: there twice"),
+        ([arm_of("small/frozen_256"), Arm("pretrain_256", "small/joint_256")], [], {}, "another name"),
+        ([arm_of("small/nope")], [], {}, "small/nope: did you mean"),
+        ([Arm("../x", "small/joint_256")], [], {}, "letters, digits"),
+        ([Arm("x.broken-1", "small/joint_256")], [], {}, "moved aside"),
+        ([Arm("a", "small/joint_256", {"seed": "3"})], [], {}, "arm a: --seed"),
+        ([arm_of("small/joint_256")], ["Pang"], {}, "--games=Pang: did you mean Pong"),
+        ([arm_of("small/joint_256")], [], {"encoder_from": "x"}, "--encoder_from"),
+        ([arm_of("small/frozen_256")], [], {"steps": "many"}, "--steps=many"),
+    ],
+)
+def test_what_cannot_be_planned(arms, games, flags, says):
+    with pytest.raises(ConfigError, match=says):
+        plan.plan(arms, games, [0], flags)
+
+
+def test_seeds():
+    assert plan.parse_seeds("3") == [0, 1, 2]
+    assert plan.parse_seeds("0,3,7") == [0, 3, 7]
+    assert plan.parse_seeds("3,") == [3]
+    for text in ("0", "", ",", "1,1", "x", "-1", "-1,2", "1,,2", "1.5", "100000"):
+        with pytest.raises(ConfigError, match="--seeds="):
+            plan.parse_seeds(text)
+
+
+def test_patterns_name_presets():
+    assert plan.presets(["small/joint_5*", "catch/joint"]) == ["small/joint_50", "catch/joint"]
+    assert len(plan.presets(["thesis/*"])) == sum(name.startswith("thesis/") for name in PRESETS)
+    with pytest.raises(ConfigError, match="--presets=Small/joint_256x: did you mean small/joint_256"):
+        plan.presets(["catch/*", "Small/joint_256x"])
+
+
+def test_a_command_line_is_the_runs_own():
+    run = Planned(
+        "Catch/a/seed2",
+        "small/frozen_256",
+        {"game": "Catch", "seed": "2", "objective": (), "rl": "rainbow"},
+        "Catch/b/seed2",
+    )
+    line = plan.command(run, "runs/x")
+    assert line[1:3] == ["-m", "experiments.train"]
+    assert line[3:] == [
+        "--preset=small/frozen_256", "--game=Catch", "--seed=2", "--objective=none", "--rl=rainbow",
+        "--encoder_from=runs/x/Catch/b/seed2", "--out=runs/x/Catch/a/seed2", "--resume=auto",
+    ]  # fmt: skip
+    assert "--out=Catch/a/seed2" in plan.command(run)
+
+
+def test_configurations_are_those_that_training_writes():
+    flags = {"encoder": "tiny:features=8", "objective": ("forward_pixels", "latent_l2"), "n_step": "2"}
+    (run,) = plan.plan([Arm("a", "small/joint_256", flags)], ["CatchDistractor"], [4], {"steps": "500"})
+    (config,) = resolving.resolve_here([run]).values()
+    assert (config.game, config.seed, config.steps) == ("CatchDistractor", 4, 500)
+    assert config.objectives == ("forward_pixels:weight=1.0", "latent_l2:weight=1e-06")
+    assert "n_step=2" in config.rl and config.encoder.startswith("tiny:features=8")
+    assert config.checkpoint_every == config.eval_every  # resolved
+
+
+@pytest.mark.parametrize(
+    "arm, says",
+    [
+        (Arm("a", "small/joint_256", {"stepz": "3"}), "Catch/a/seed0: Unknown command line flag 'stepz'"),
+        (Arm("a", "small/joint_256", {"steps": "0"}), "Catch/a/seed0: --steps=0: must be at least 1"),
+        (Arm("a", "small/rl_only_256", {"objective": ("x",)}), "runs no representation loss"),
+        (Arm("a", "small/joint_256", {"objective": ("x",)}), "Catch/a/seed0: --objective=x"),
+        (
+            Arm("a", "small/frozen_256", {"encoder": "tiny:features=9"}),
+            "cannot start from Catch/pretrain_256",
+        ),
+    ],
+)
+def test_settings_that_cannot_be_run_name_the_run(arm, says):
+    with pytest.raises(ConfigError, match=says):
+        resolving.resolve_here(plan.plan([arm], ["Catch"], [0]))
