@@ -94,31 +94,40 @@ def write(path: Path, text: str) -> None:
         raise SaveError(f"--out={path}: {error.strerror}") from None
 
 
+def report(values: flags.FlagValues) -> Path:
+    """Checks the command line, reads the runs and writes the page.
+
+    Args:
+        values: parsed flags, as `define_flags` defines them.
+
+    Returns:
+        The file that was written.
+
+    Raises:
+        ConfigError: the command line or what the runs hold is not valid; nothing was written.
+        SaveError: the page cannot be written.
+    """
+    runs = values["runs"].value
+    if not runs:
+        raise ConfigError("--runs: missing; name a directory of runs, python -m experiments.report runs/")
+    path = check_out(values["out"].value, overwrite=values["overwrite"].value)
+    reach = check_reach(values["reach"].value)
+    if not Path(runs).is_dir():
+        raise ConfigError(f"--runs={runs}: no such directory")
+    if not plots.available():
+        raise ConfigError("the pictures of a report need matplotlib and Pillow: pip install 'srl-jax[plots]'")
+    from experiments.reporting import page
+
+    same = {name: values[name].value for name in ("baseline", "force", "finished_only", "media")}
+    write(path, page.build(runs, reach=reach, **same))
+    return path
+
+
 def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
-    if not FLAGS.runs:
-        raise ConfigError("--runs: missing; name a directory of runs, python -m experiments.report runs/")
-    path = check_out(FLAGS.out, overwrite=FLAGS.overwrite)
-    reach = check_reach(FLAGS.reach)
-    if not Path(FLAGS.runs).is_dir():
-        raise ConfigError(f"--runs={FLAGS.runs}: no such directory")
-    if not plots.available():
-        raise ConfigError(
-            "a report has pictures, which need matplotlib and Pillow: pip install 'srl-jax[plots]'"
-        )
-    from experiments.reporting import page
-
-    text = page.build(
-        FLAGS.runs,
-        baseline=FLAGS.baseline,
-        reach=reach,
-        force=FLAGS.force,
-        finished_only=FLAGS.finished_only,
-        media=FLAGS.media,
-    )
-    write(path, text)
-    print(f"{path}: {len(text.encode()) / 1e6:.1f} MB")
+    path = report(FLAGS)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
 if __name__ == "__main__":

@@ -77,13 +77,15 @@ def _chromium() -> str | None:
     return shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
 
-def render(page: Path, widths: Sequence[int] = tuple(WIDTHS.values()), scale: float = 1.0) -> list[Rendered]:
+def render(
+    page: Path, widths: Sequence[int] = tuple(WIDTHS.values()), scheme: str = "light"
+) -> list[Rendered]:
     """Opens a file at several widths.
 
     Args:
         page: the HTML file.
         widths: CSS pixels.
-        scale: pixels of the screenshot for one of CSS.
+        scheme: of its colours, "light" or "dark".
 
     Raises:
         ConfigError: the browser does not start or does not answer.
@@ -91,8 +93,10 @@ def render(page: Path, widths: Sequence[int] = tuple(WIDTHS.values()), scale: fl
     with _session() as call:
         found = []
         for width in widths:
-            phone = {"width": width, "height": 900, "deviceScaleFactor": scale, "mobile": width < 600}
+            phone = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 600}
             call("goog/cdp/execute", cmd="Emulation.setDeviceMetricsOverride", params=phone)
+            features = [{"name": "prefers-color-scheme", "value": scheme}]
+            call("goog/cdp/execute", cmd="Emulation.setEmulatedMedia", params={"features": features})
             call("url", url="about:blank")
             call("se/log", type="browser")  # what there was before, the browser's own first page
             call("se/log", type="performance")
@@ -186,7 +190,7 @@ def main(argv: list[str]) -> int:
         raise ConfigError("needs chromium and chromedriver, Debian's chromium and chromium-driver")
     out = config_flags.check_place("out", FLAGS.out) if FLAGS.out else None
     wrong = []
-    for name, found in zip(WIDTHS, render(Path(FLAGS.page)), strict=True):
+    for name, found in zip(WIDTHS, render(Path(FLAGS.page), scheme=FLAGS.scheme), strict=True):
         wrong += problems(found)
         if out is not None:
             out.mkdir(parents=True, exist_ok=True)
@@ -199,4 +203,5 @@ def main(argv: list[str]) -> int:
 if __name__ == "__main__":
     flags.DEFINE_string("page", None, "HTML file to open")
     flags.DEFINE_string("out", None, "directory for the screenshots; none if not given")
+    flags.DEFINE_enum("scheme", "light", ["light", "dark"], "colours that the reader prefers")
     config_flags.run(main)

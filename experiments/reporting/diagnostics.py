@@ -24,38 +24,52 @@ class Form(NamedTuple):
         title: of the picture.
         place: which element of a list is drawn; 0: of the oldest encoder kept, -1: of the newest.
         meaning: what a reader has to know.
+        first: whether it is shown at once; the others are shown when they are asked for.
     """
 
     key: str
     title: str
     place: int = 0
     meaning: str = ""
+    first: bool = False
 
 
 FORMS = (
-    Form("diag/effective_rank", "effective rank", meaning="how many directions the latent uses"),
-    Form("diag/dormant_share", "dormant units", meaning="share of the latent's units that hardly ever act"),
-    Form("diag/constant_share", "constant units", meaning="share of units that are the same for all inputs"),
-    Form("diag/drift/cosine", "cosine to the oldest latents", 0, "the same inputs, encoded then and now"),
-    Form("diag/drift/cosine", "cosine to the last latents", -1, "likewise, the newest encoder kept"),
-    Form("diag/drift/cka", "CKA with the oldest latents", 0, "likewise, by centred kernel alignment"),
+    Form("diag/effective_rank", "effective rank", 0, "how many directions the latent uses", True),
+    Form("diag/dormant_share", "dormant units", 0, "share of the latent's units that hardly ever act", True),
+    Form("diag/constant_share", "constant units", 0, "share of units that are the same for all inputs"),
+    Form(
+        "diag/drift/cosine", "cosine to the oldest latents", 0,
+        "drift: the same inputs, encoded now and by the oldest encoder kept", True,
+    ),
+    Form("diag/drift/cosine", "cosine to the last latents", -1, "and by the encoder kept last"),
+    Form(
+        "diag/drift/cka", "CKA with the oldest latents", 0,
+        "likewise, by centred kernel alignment, which no rotation changes", True,
+    ),
     Form("diag/drift/cka", "CKA with the last latents", -1),
     Form(
-        "diag/decoder_now/*", "{}: decoder now, oldest encoder", 0,
-        "mean squared error of today's decoder on an old encoder's latents",
+        "diag/decoder_now/*", "{}: old encoder, decoder of now", 0,
+        "mean squared error of the decoder of now on latents of the oldest encoder kept", True,
     ),
-    Form("diag/decoder_now/*", "{}: decoder now, encoder now", -1),
-    Form("diag/encoder_now/*", "{}: oldest decoder, encoder now", 0, "and the other way round"),
+    Form("diag/decoder_now/*", "{}: encoder and decoder of now", -1, "mean squared error"),
+    Form("diag/encoder_now/*", "{}: encoder of now, old decoder", 0, "mean squared error"),
     Form(
-        "diag/gradient/*/cosine", "{}: cosine with RL's gradient",
-        meaning="below 0: the losses pull the encoder apart",
+        "diag/gradient/*/cosine", "{}: cosine with RL's gradient", 0,
+        "of the gradients on the encoder; below 0, they pull it apart", True,
     ),
     Form("diag/gradient/*/norm_ratio", "{}: gradient norm over RL's"),
-    Form("diag/error/*/moving", "{}: error on moving pixels", meaning="does it lose the ball?"),
+    Form("diag/error/*/moving", "{}: error on moving pixels"),
     Form("diag/error/*/static", "{}: error on static pixels"),
-    Form("diag/error/*/moving_explained", "{}: explained, moving pixels", meaning="0: as the mean image"),
+    Form(
+        "diag/error/*/moving_explained", "{}: explained of what moves", 0,
+        "does it lose the ball? 1: none of it; 0: it is no better than the mean image", True,
+    ),
     Form("diag/moving_share", "share of pixels that move"),
-    Form("diag/probe/mean", "linear probe, mean R²", meaning="the true state from the latent, linearly"),
+    Form(
+        "diag/probe/mean", "linear probe, mean R²", 0,
+        "how much of the game's true state can be read from the latent linearly", True,
+    ),
     Form("diag/probe/*", "linear probe, {}: R²"),
 )  # fmt: skip
 """In the order of the page; keys without a form come last, under their own names."""
@@ -67,6 +81,7 @@ class Panel(NamedTuple):
     title: str
     meaning: str
     picture: Picture
+    first: bool
 
 
 def keys_of(runs: Sequence[RunData]) -> list[str]:
@@ -93,7 +108,7 @@ def panels(runs: Sequence[RunData], arms: Sequence[str]) -> list[Panel]:
                     lines[place] = curve
             if lines:
                 title = form.title.format(_middle(key, form.key))
-                found.append(Panel(title, form.meaning, pictures.curves(title, lines)))
+                found.append(Panel(title, form.meaning, pictures.curves(title, lines), form.first))
     return found
 
 

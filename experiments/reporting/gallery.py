@@ -1,15 +1,17 @@
 """The pictures of a report, in their sections."""
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from experiments import collect, diagnostic_plots
 from experiments.collect import RunData
 from experiments.reporting import diagnostics, pictures
 from experiments.reporting.contents import Content, Report, run_name
-from experiments.reporting.markup import Markup, figure, listed, plural, tag
+from experiments.reporting.markup import Markup, breakable, details, figure, listed, plural, tag
 from srl_jax import statistics
 from srl_jax.data import published
 from srl_jax.errors import ConfigError
@@ -58,12 +60,16 @@ def learning_curves(report: Report) -> Content:
             continue
         levels = [("random policy, published", x.score) for x in published(game) if x.method == "Random"]
         arms = [arm for arm in report.arms if arm in comparison.returns]
+        curves = {}
+        for arm in arms:
+            interval = statistics.curve_interval(comparison.returns[arm])
+            curves[report.arms.index(arm)] = pictures.Curve(comparison.steps, *interval)
+        limits = _limits_of(curves.values(), levels)
         for group in groups(arms, report.baseline):
-            lines = {}
-            for arm in group:
-                found = statistics.curve_interval(comparison.returns[arm])
-                lines[report.arms.index(arm)] = pictures.Curve(comparison.steps, *found)
-            picture = pictures.curves(game, lines, size=(5.4, 3.5), label="mean return", levels=levels)
+            lines = {report.arms.index(arm): curves[report.arms.index(arm)] for arm in group}
+            picture = pictures.curves(
+                game, lines, size=(5.4, 3.5), label="mean return", levels=levels, limits=limits
+            )
             caption = _legend(report, {arm: len(comparison.returns[arm]) for arm in group})
             drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))
     if not drawn:
@@ -72,6 +78,14 @@ def learning_curves(report: Report) -> Content:
         "Mean evaluation return, and its 95 % interval over seeds, at env steps that all runs of a game have."
     )
     return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
+
+
+def _limits_of(curves: Iterable[pictures.Curve], levels: Sequence[tuple[str, float]]) -> tuple[float, float]:
+    """Of the vertical axis of all pictures of a game, so that they can be compared."""
+    values = np.concatenate([*(np.concatenate(curve[1:]) for curve in curves), [y for _, y in levels]])
+    low, high = np.nanmin(values), np.nanmax(values)
+    room = 0.05 * (high - low) or 0.5
+    return float(low - room), float(high + room)
 
 
 def groups(arms: Sequence[str], baseline: str | None) -> list[list[str]]:
@@ -107,7 +121,7 @@ def playing(report: Report) -> Content:
         cells = []
         for run in _first_runs(report, game):
             if picture := pictures.taken(run.path / "figures" / "play.gif", limit):
-                caption = [tag("strong", run.arm), f", seed {run.seed}"]
+                caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}"]
                 cells.append(figure(picture.source, caption, f"{run_name(run)}, playing"))
         if cells:
             parts += [tag("h3", game), tag("div", cells, class_="grid play")]
@@ -126,7 +140,7 @@ def panels(report: Report) -> Content:
         for run in _first_runs(report, game):
             for path in _panels(run):
                 picture = pictures.taken(path, limit)
-                caption = [tag("strong", run.arm), f", seed {run.seed}: {path.stem}"]
+                caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}: {path.stem}"]
                 cells.append(figure(picture.source, caption, f"{run_name(run)}: {path.stem}", picture.size))
         if cells:
             parts += [tag("h3", game), tag("div", cells, class_="grid media")]
@@ -168,18 +182,24 @@ def diagnostic_pictures(report: Report) -> Content:
         found = diagnostics.panels(report.of(game), report.arms)
         if not found:
             continue
-        cells = [
-            figure(panel.picture.source, panel.meaning, f"{game}: {panel.title}", panel.picture.size)
-            for panel in found
-        ]
+        first, others = (
+            [_panel(game, panel) for panel in found if panel.first == at_once] for at_once in (True, False)
+        )
         having = {run.arm for run in report.of(game) if diagnostics.keys_of([run])}
         seeds = {arm: len(report.of(game, arm)) for arm in report.arms if arm in having}
-        parts += [tag("h3", game), _legend(report, seeds), tag("div", cells, class_="grid small")]
+        parts += [tag("h3", game), _legend(report, seeds), tag("div", first, class_="grid small")]
+        if others:
+            more = f"{plural(len(others), 'more picture')} of {game}"
+            parts.append(details(more, tag("div", others, class_="grid small")))
         parts.append(_drift(report, game))
     if without:
         parts.append(tag("p", f"Without diagnostics: {listed(map(run_name, without))}.", class_="note"))
     note = "Measured at every evaluation; means and 95 % intervals over seeds."
     return [tag("p", note, class_="note"), *parts]
+
+
+def _panel(game: str, panel: diagnostics.Panel) -> Markup:
+    return figure(panel.picture.source, panel.meaning, f"{game}: {panel.title}", panel.picture.size)
 
 
 def _drift(report: Report, game: str) -> Content:
@@ -189,7 +209,7 @@ def _drift(report: Report, game: str) -> Content:
         picture = pictures.drawn(functools.partial(diagnostic_plots.drift_matrix, run.rows, title=""))
         if picture is not None:
             caption = [
-                tag("strong", run.arm),
+                tag("strong", breakable(run.arm)),
                 f", seed {run.seed}: each epoch's decoder on each epoch's encoder",
             ]
             found.append(figure(picture.source, caption, f"{run_name(run)}: drift", picture.size))

@@ -83,7 +83,7 @@ def arms_of(runs: Sequence[RunData]) -> list[str]:
     """All arms: those of the presets in their order, then the others; those without a policy last."""
     known = {name.partition("/")[2] or name: i for i, name in reversed(list(enumerate(PRESETS)))}
     playing = {run.arm for run in runs if has_policy(run)}
-    return sorted({run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(known)), a))
+    return sorted({run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(PRESETS)), a))
 
 
 def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None = None) -> str | None:
@@ -134,6 +134,8 @@ def _last(steps: int, every: int) -> int:
 def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Comparison | None]:
     """Game -> its learning curves at equal steps; None where there is no step that all runs have.
 
+    A run that was evaluated once is left out where others were evaluated more often: it has only just begun.
+
     Raises:
         ConfigError: the evaluations of a run are not in ascending order.
     """
@@ -142,6 +144,7 @@ def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Compariso
         members = [
             run for arm in arms for run in by_arm.get(arm, []) if len(collect.steps_and_returns(run)[0])
         ]
+        members = [run for run in members if len(collect.steps_and_returns(run)[0]) > 1] or members
         if not members:
             continue
         curves = [collect.steps_and_returns(run) for run in members]

@@ -5,15 +5,18 @@ from collections.abc import Sequence
 import numpy as np
 
 from experiments import collect
-from experiments.reporting import configs, numbers
+from experiments.reporting import configs, numbers, pictures
 from experiments.reporting.configs import About
 from experiments.reporting.contents import Content, Report, limits, run_name, side
-from experiments.reporting.markup import Markup, details, listed, number, plural, table, tag
+from experiments.reporting.markup import Markup, details, figure, listed, number, plural, table, tag
+from experiments.reporting.numbers import Row
 from experiments.reporting.tables import interval_of, summary_of
 from srl_jax.statistics import Interval
 
 FEW = 10
 """Seeds below which intervals are too narrow for comfort."""
+FEW_ARMS = 3
+"""Arms whose differences are said in the text; more are in the tables alone."""
 
 
 def what_was_run(report: Report) -> Content:
@@ -42,7 +45,7 @@ def what_was_run(report: Report) -> Content:
             tag("li", f"{run_name(run)}: {numbers.reached_step(run):,} of {run.config.steps:,} env steps")
             for run in left
         ]
-        how = "not compared" if report.finished_only else "compared as far as they have got"
+        how = "not compared" if report.finished_only else "compared as far as they have been evaluated"
         parts.append(tag("div", tag("strong", f"Not finished, {how}:"), tag("ul", items), class_="warn"))
     if len(revisions) > 1:
         parts.append(tag("p", "The runs are of several revisions of the code.", class_="note"))
@@ -89,8 +92,9 @@ def _all_runs(report: Report, abouts: Sequence[About]) -> Markup:
 
 
 def what_it_says(report: Report) -> Content:
-    """The comparison in sentences: only what follows from an interval."""
+    """The comparison in sentences, only what follows from an interval, and as a picture of each game."""
     parts: list = []
+    pictured: list = []
     for game, comparison in report.comparisons.items():
         rows = {row.arm: row for row in report.rows if row.game == game}
         base = rows.pop(report.baseline, None)
@@ -104,8 +108,10 @@ def what_it_says(report: Report) -> Content:
             found = {arm: getattr(row, f"{of}_difference") for arm, row in rows.items()}
             items.append(_sentence(report, what, getattr(base, of), found))
         parts.append(tag("ul", items))
+        pictured += _picture(report, game, rows)
     parts += _over_games(report)
-    if not parts:
+    parts.append(tag("div", pictured, class_="grid wide") if pictured else None)
+    if not any(parts):
         return None
     if max((row.seeds for row in report.rows), default=0) < FEW:
         note = (
@@ -115,6 +121,21 @@ def what_it_says(report: Report) -> Content:
         )
         parts.append(tag("p", note, class_="note"))
     return parts
+
+
+def _picture(report: Report, game: str, rows: dict[str, Row]) -> list:
+    """The differences from the baseline; none where no arm has an interval."""
+    rows = {arm: row for arm, row in rows.items() if row.final_difference is not None}
+    if all(np.isnan(row.final_difference.low) for row in rows.values()):
+        return []
+    panels = {
+        "at the end": {arm: row.final_difference for arm, row in rows.items()},
+        "averaged over env steps": {arm: row.area_difference for arm, row in rows.items()},
+    }
+    places = [report.arms.index(arm) for arm in rows]
+    picture = pictures.differences(game, report.baseline, panels, places)
+    caption = f"{game}: returns less those of {report.baseline}, and their 95 % intervals"
+    return [figure(picture.source, caption, f"{game}: differences from {report.baseline}", picture.size)]
 
 
 def _over_games(report: Report) -> list:
@@ -140,16 +161,19 @@ def _over_games(report: Report) -> list:
 def _sentence(report: Report, what: str, base: Interval, differences: dict[str, Interval | None]) -> Markup:
     """What the baseline has, and the arms whose difference from it has an interval without 0."""
     known = {arm: x for arm, x in differences.items() if x is not None and not np.isnan(x.low)}
-    clear = [
-        f"{arm}, {number(abs(float(x.point)))} {'above' if side(x) > 0 else 'below'} {limits(x)}"
-        for arm, x in known.items()
-        if side(x)
-    ]
+    clear = {arm: x for arm, x in known.items() if side(x)}
     text = f"{what}: {report.baseline} has {number(float(base.point))} {limits(base)}. "
-    if clear:
-        text += f"Different from it, by an interval that excludes 0: {'; '.join(clear)}. "
-        text += "All other intervals contain 0. " if len(clear) < len(known) else ""
-    elif known:
+    for word, sign in (("Above", 1), ("Below", -1)):
+        items = [arm for arm, x in clear.items() if side(x) == sign]
+        if FEW_ARMS < len(items) == len(differences):
+            items = ["all other arms"]
+        elif len(items) <= FEW_ARMS:
+            items = [f"{arm} ({number(float(clear[arm].point))} {limits(clear[arm])})" for arm in items]
+        if items:
+            text += f"{word} it, by an interval that excludes 0: {listed(items)}. "
+    if clear and len(clear) < len(known):
+        text += f"Not told apart from it: {listed(arm for arm in known if arm not in clear)}. "
+    elif known and not clear:
         text += "No arm differs from it by an interval that excludes 0. "
     if unknown := len(differences) - len(known):
         text += (

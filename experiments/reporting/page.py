@@ -84,6 +84,7 @@ def gather(
         raise ConfigError(f"--reach={unknown[0]}: no run of that game; valid: {', '.join(games)}")
     arms = numbers.arms_of(runs)
     against = numbers.baseline_of(runs, arms, baseline)
+    arms = sorted(arms, key=lambda arm: arm != against)  # it first, the others as they were
     compared = [run for run in runs if not finished_only or numbers.finished(run)]
     comparisons = numbers.compare(compared, arms)
     targets = numbers.targets(comparisons, against, reach)

@@ -152,8 +152,12 @@ def _as_jpeg(image, size: tuple[int, int]) -> Picture:
 
 
 def interval_curves(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
-    """The mean of several runs' curves and its interval, at steps that all have; None without such."""
+    """The mean of several runs' curves and its interval, at steps that all have; None without such.
+
+    A run with one value is left out where others have more.
+    """
     kept = [(steps, values) for steps, values in runs if len(steps)]
+    kept = [run for run in kept if len(run[0]) > 1] or kept
     if not kept:
         return None
     try:
@@ -170,6 +174,7 @@ def curves(
     size: tuple[float, float] = (3.4, 2.3),
     label: str = "",
     levels: Sequence[tuple[str, float]] = (),
+    limits: tuple[float, float] | None = None,
 ) -> Picture:
     """A picture of one number against env steps; which line is whose is said beside it.
 
@@ -179,6 +184,7 @@ def curves(
         size: width and height in inches.
         label: of the vertical axis.
         levels: names and heights of dotted lines across.
+        limits: of the vertical axis; None for what the lines need.
     """
     small = size[0] < 4
 
@@ -204,6 +210,45 @@ def curves(
         axes.tick_params(labelsize=7 if small else 9)
         axes.set_xlabel(plots.STEPS_LABEL, fontsize=7.5 if small else 9)
         axes.set_ylabel(label, fontsize=9)
+        if limits is not None:
+            axes.set_ylim(*limits)
+        plots._save(figure, path)
+
+    return drawn(draw)
+
+
+def differences(
+    title: str, baseline: str, panels: Mapping[str, Mapping[str, statistics.Interval]], places: Sequence[int]
+) -> Picture:
+    """A picture of how arms differ from the baseline: a point and an interval each, beside 0.
+
+    Args:
+        title: above it.
+        baseline: its name.
+        panels: what differs -> arm -> the difference; the same arms in each.
+        places: of the arms, which give their colours.
+    """
+
+    def draw(path: Path) -> None:
+        arms = list(next(iter(panels.values())))
+        figure = plots._figure(5.4, 1.1 + 0.3 * len(arms))
+        figure.suptitle(title, fontsize=11).set_parse_math(False)
+        grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+        for axes, (name, found) in zip(grid, panels.items(), strict=True):
+            axes.axvline(0, color="#555555", linewidth=1)
+            for i, (interval, place) in enumerate(zip(found.values(), places, strict=True)):
+                colour, _ = style(place)
+                axes.plot([interval.low, interval.high], [i, i], color=colour, linewidth=2.2)
+                axes.plot([interval.point], [i], "o", color=colour, markersize=5)
+            axes.set_yticks(range(len(arms)), arms, fontsize=8, parse_math=False)
+            axes.set_ylim(len(arms) - 0.4, -0.6)
+            axes.set_title(name, fontsize=8.5, parse_math=False)
+            axes.grid(axis="x", alpha=0.25, linewidth=0.6)
+            axes.spines[["top", "right", "left"]].set_visible(False)
+            axes.tick_params(axis="y", length=0)
+            axes.tick_params(axis="x", labelsize=8)
+            axes.margins(x=0.08)
+        figure.supxlabel(f"difference from {baseline}", fontsize=8).set_parse_math(False)
         plots._save(figure, path)
 
     return drawn(draw)

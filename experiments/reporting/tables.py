@@ -83,11 +83,11 @@ def _of_game(report: Report, game: str, comparison: Comparison) -> list:
 def _reaching(row: Row, end: int) -> list:
     shown = [f"> {end:,}" if value > end else f"{value:,.0f}" for value in row.reaching]
     span = "" if np.isnan(row.reaching.low) else f"[{shown[1]}, {shown[2]}], "
-    return [shown[0], tag("span", f"{span}{row.reached} of {row.seeds} did", class_="ci")]
+    return [shown[0], " ", tag("span", f"{span}{row.reached} of {row.seeds} did", class_="ci")]
 
 
 def _cell(interval: Interval) -> list:
-    return [number(float(interval.point)), tag("span", limits(interval), class_="ci")]
+    return [number(float(interval.point)), " ", tag("span", limits(interval), class_="ci")]
 
 
 def _difference(interval: Interval | None) -> Content:
@@ -98,7 +98,7 @@ def _difference(interval: Interval | None) -> Content:
         shown = tag("span", f"{shown} ▲", class_="up")
     elif direction < 0:
         shown = tag("span", f"{shown} ▼", class_="down")
-    return [shown, tag("span", limits(interval), class_="ci")]
+    return [shown, " ", tag("span", limits(interval), class_="ci")]
 
 
 def interval_of(row: Mapping[str, Any]) -> Interval:

@@ -1,0 +1,378 @@
+"""experiments.report: what is on the page, its numbers by hand, and what it refuses."""
+
+import dataclasses
+import json
+import shutil
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from absl import flags
+
+from experiments import flags as config_flags
+from experiments import plots, report
+from experiments.collect import RunData
+from experiments.reporting import browser
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
+
+pytestmark = pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
+
+ODD = '<b>&"odd"'
+"""Of an arm whose name is HTML."""
+CURVES = {
+    ("rl", 0): [0.0, 0.5, 1.0],
+    ("rl", 1): [0.0, 0.0, 0.5],
+    ("joint", 0): [0.0, 1.0, 1.0, 5.0],
+    ("joint", 1): [0.0, 1.0, 1.0],
+    (ODD, 0): [-1.0, -1.0, -1.0],
+}
+"""Returns at 0, 100, 200 (and 300) env steps; joint goes on further than the others do."""
+
+
+def write_run(path, returns=(), *, speed=100.0, diag=None, **values):
+    """A run of 200 env steps, unless told otherwise, with two rows of training and its evaluations."""
+    path.mkdir(parents=True)
+    fields = {"game": "Catch", "frame_size": 42, "steps": 200, "eval_every": 100, "log_every": 100}
+    config = Config(**fields | values)
+    about = {
+        "versions": {"jax": "1.2.3"},
+        "git_revision": "0123456789abcdef",
+        "started": "2026-01-02 03:04:05",
+    }
+    (path / "config.json").write_text(json.dumps({**dataclasses.asdict(config), **about}))
+    rows = []
+    for i, value in enumerate(returns):
+        rows.append({"kind": "eval", "env_steps": 100 * i, "updates": i, "eval/return_mean": value})
+        rows[-1] |= {key: x[i] for key, x in (diag or {}).items()} | {"wall_s": 3600.0 * i}
+    for step in (100, 200):
+        row = {"kind": "train", "env_steps": step, "updates": 1, "wall_s": 3600.0 * step / 100}
+        rows.append(row | {"wall_steps_per_s": speed})
+    (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return path
+
+
+class Page(HTMLParser):
+    """What is in a page: its elements, its text, its tables, and whether everything that opens is closed."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.attributes, self.words, self.tables = [], [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open
+        self.text = " ".join("".join(self.words).split())
+
+    def handle_starttag(self, tag, attributes):
+        self.attributes.append((tag, dict(attributes)))
+        if tag not in ("meta", "link", "img", "wbr"):
+            self.open.append(tag)
+        if tag == "div" and dict(attributes).get("role") == "region":
+            self.tables.append((dict(attributes)["aria-label"], []))
+        elif tag == "tr":
+            self.tables[-1][1].append([])
+        elif tag in ("td", "th"):
+            self.tables[-1][1][-1].append("")
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+        if tag in ("p", "li", "td", "th", "dd", "dt", "h1", "h2", "h3", "figcaption", "span"):
+            self.handle_data(" ")
+
+    def handle_data(self, data):
+        if "style" not in self.open:
+            self.words.append(data)
+        if {"td", "th"} & set(self.open):
+            cells = self.tables[-1][1][-1]
+            cells[-1] = " ".join((cells[-1] + data).split(" ")) if data != " " else cells[-1].rstrip() + " "
+
+    def table(self, label):
+        """Row heading -> {column heading, or its place: cell}, of the table with this label."""
+        (rows,) = [rows for name, rows in self.tables if name == label]
+        return {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows}
+
+
+def build(runs, **options):
+    from experiments.reporting import page
+
+    return page.build(runs, **options)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Three arms on Catch, one with a name that is HTML; a figure, pictures, diagnostics of one."""
+    root = tmp_path_factory.mktemp("report") / "runs"
+    lists = {"diag/drift/steps": [[], [0], [0, 100]], "diag/drift/cka": [[], [0.5], [0.25, 0.75]]}
+    for (arm, seed), returns in CURVES.items():
+        own = {"mode": "joint", "objectives": ("reconstruction:weight=2",)} if arm == "joint" else {}
+        diag = (
+            {"diag/effective_rank": [3.0, 2.0, None], "diag/new": [1, 2, 3], **lists} if arm == ODD else None
+        )
+        speed = 50.0 if arm == "joint" else 100.0
+        place = root / f"Catch/{arm}/seed{seed}"
+        if arm == "joint":
+            own |= {"steps": 300} if seed == 0 else {"steps": 300, "eval_games": 10}
+        write_run(place, returns, speed=speed, diag=diag, seed=seed, **own)
+    frames = np.zeros((30, 42, 42), np.uint8)
+    plots.gif(frames, root / "Catch/rl/seed0/figures/play.gif")
+    image = np.zeros((2, 8, 8, 1), np.float32)
+    plots.image_panel(image, image, image, root / "Catch/joint/seed0/figures/reconstruction.png", "")
+    shutil.copytree(root / "Catch/joint/seed0/figures", root / "figures")
+    about = {"figure": "6.3", "title": "Joint <script>", "question": "Does it help?"}
+    (root / "figures/reconstruction.json").write_text(json.dumps(about))
+    return root
+
+
+@pytest.fixture(scope="module")
+def text(runs):
+    return build(runs, baseline="rl")
+
+
+@pytest.fixture(scope="module")
+def page(text):
+    return Page(text)
+
+
+def test_nothing_is_asked_for_from_outside(page):
+    for tag, attributes in page.attributes:
+        assert tag not in ("script", "iframe", "object", "form", "base")
+        assert not [name for name in attributes if name.startswith("on")]
+        for name in ("src", "href", "srcset", "action"):
+            assert attributes.get(name, "#").startswith(("#", "data:"))
+    policy = next(
+        a["content"] for _, a in page.attributes if a.get("http-equiv") == "Content-Security-Policy"
+    )
+    assert policy.startswith("default-src 'none'")
+    ids = [attributes["id"] for _, attributes in page.attributes if "id" in attributes]
+    links = [attributes["href"] for tag, attributes in page.attributes if tag == "a"]
+    assert links == [f"#{name}" for name in ids] and len(set(ids)) == len(ids) == 11
+    assert all(a["alt"] for tag, a in page.attributes if tag == "img")
+
+
+def test_every_arm_and_every_run_is_there_as_text(page, text):
+    assert ODD in page.text and "<b>" not in text and "<script" not in text
+    assert "Figure 6.3. Joint <script> Does it help?" in page.text
+    runs = page.table("Every run")
+    assert {f"Catch / {arm} / seed {seed}" for arm, seed in CURVES} < set(runs)
+    assert runs["Catch / joint / seed 0"][:4] == ["300 of 300", "yes", "4", "5.00 at 300"]
+    assert "4 of 5 runs" in page.text and "Catch / joint / seed 1: 200 of 300 env steps" in page.text
+    assert "0123456789" in page.text and "2026-01-02 03:04:05" in page.text and "jax 1.2.3" in page.text
+
+
+def test_numbers_by_hand(page):
+    # rl ends at 0.75 on average. Areas: (0.25 + 0.75) / 2 and (0 + 0.25) / 2; joint's (0.5 + 1) / 2, twice.
+    # Two runs drawn again are all four pairs of them, so the limits of a difference are its extremes.
+    table = page.table("Statistics of Catch")
+    assert table["arm"][1::2] == ["return at 200", "mean return up to 200", "env steps to reach 0.75"]
+    assert table["rl"][0] == "2" and table["rl"][1] == "0.75 [0.50, 1.00]" and table["rl"][2] == "–"
+    assert table["rl"][3] == "0.31 [0.12, 0.50]"
+    # One of rl's two runs is at 0.75 after 150 env steps, the other one never.
+    assert table["rl"][5] == "> 200 [150, > 200], 1 of 2 did"
+    assert table["joint"][1:3] == ["1.00 [1.00, 1.00]", "+0.25 [0.00, 0.50]"]
+    assert table["joint"][3:5] == ["0.75 [0.75, 0.75]", "+0.44 ▲ [0.25, 0.62]"]
+    assert table["joint"][5] == "75 [75, 75], 2 of 2 did"
+    assert table[ODD][:3] == ["1", "−1.00 (no interval)", "−1.75 (no interval)"]
+    assert "Compared up to 200 env steps, where rl, seed 0, ended." in page.text
+    # Human-normalised: a miss is -1 and a catch 1. A tie counts half: (0.5 + 1) / 2.
+    over = page.table("The return at the end, over games")
+    assert over["joint"][1] == "1.00 [1.00, 1.00]" and over["rl"][1] == "0.88 [0.75, 1.00]"
+    assert over["joint"][4:] == ["0.00 [0.00, 0.00]", "0.75 [0.50, 1.00]"]
+
+
+def test_the_sentences_say_what_the_intervals_say(page):
+    assert (
+        "rl has 0.31 [0.12, 0.50]. Above it, by an interval that excludes 0: joint (0.44 [0.25, 0.62])."
+        in page.text
+    )
+    assert "1 arm without an interval" in page.text and "too narrow" in page.text
+
+
+def test_cost_and_settings(page):
+    cost = page.table("Time and cost of each arm")
+    assert cost["Catch / rl"] == ["2", "4.0 h", "2.0 h", "100", "1.00 times"]
+    assert cost["Catch / joint"][-2:] == ["50", "2.00 times"]
+    settings = page.table("Settings on Catch")
+    assert settings["field"] == ["rl", "joint", ODD]
+    assert settings["mode"] == ["rl_only", "joint", "rl_only"]
+    assert settings["objectives reconstruction: weight"] == ["–", "2", "–"]
+    assert set(settings) == {"field", "mode", "objectives", "objectives reconstruction: weight", "steps"}
+
+
+def test_diagnostics_are_drawn_and_missing_ones_said(page):
+    pictures = [attributes["alt"] for tag, attributes in page.attributes if tag == "img"]
+    names = {name.removeprefix("Catch: ") for name in pictures}
+    assert {"effective rank", "CKA with the oldest latents", "CKA with the last latents", "new"} < names
+    without = "Without diagnostics: Catch / joint / seed 0, Catch / joint / seed 1, Catch / rl / seed 0 and"
+    assert without in page.text
+
+
+def test_the_same_runs_give_the_same_bytes(runs, text, tmp_path):
+    shutil.copytree(runs, tmp_path / "runs")  # with other times of its files
+    assert build(tmp_path / "runs", baseline="rl") == text
+
+
+def test_a_page_of_runs_of_before(tmp_path):
+    # No pictures, no diagnostics, one seed, and of one arm a run that has just begun.
+    write_run(tmp_path / "a/seed0", [0.0, 1.0, 1.0])
+    write_run(tmp_path / "b/seed0", [-1.0], mode="joint")
+    write_run(tmp_path / "pretrain/seed0", mode="pretrain")
+    page = Page(build(tmp_path, media=False))
+    assert "These runs have no diagnostics" in page.text and "no_media" in page.text
+    assert list(page.table("Statistics of Catch")) == ["arm", "a"]
+    assert "Catch / b / seed 0: 200 of 200 env steps" in page.text  # it lacks evaluations
+    assert [a["alt"] for tag, a in page.attributes if tag == "img"] == ["Catch: learning curves"]
+    assert "pretrain" in page.table("Settings on Catch")["field"]
+
+
+def test_other_protocols_are_refused_or_said(tmp_path):
+    write_run(tmp_path / "a/seed0", [0.0, 1.0])
+    write_run(tmp_path / "a/seed1", [0.0, 1.0], gamma=0.5, seed=1)
+    write_run(tmp_path / "b/seed0", [0.0, 1.0], sticky_actions=0.25)
+    with pytest.raises(ConfigError, match="sticky_actions is 0.0 there and 0.25 here; --force"):
+        build(tmp_path)
+    page = Page(build(tmp_path, force=True, media=False))
+    assert "Compared by force (--force), though these differ:" in page.text
+    assert "sticky_actions is 0.0 there and 0.25 here" in page.text and "gamma is 0.99" in page.text
+    shutil.rmtree(tmp_path / "b")
+    with pytest.raises(ConfigError, match="gamma is 0.99 there and 0.5 here; --force"):
+        build(tmp_path)
+
+
+def test_what_is_asked_for_must_be_there(runs):
+    with pytest.raises(
+        ConfigError, match="--baseline=other: not an arm with a policy; valid: <b>.*joint, rl"
+    ):
+        build(runs, baseline="other")
+    with pytest.raises(ConfigError, match="--reach=Pong: no run of that game; valid: Catch"):
+        build(runs, reach={"Pong": 1.0})
+
+
+@pytest.mark.parametrize(
+    ("file", "content", "message"),
+    [
+        ("figures/a.png", b"no picture", "a.png: neither a PNG nor a GIF"),
+        ("figures/reconstruction.json", b"[1]", "reconstruction.json: not a JSON object"),
+        ("Catch/rl/seed0/figures/play.gif", b"<svg>", "play.gif: neither"),
+        ("Catch/rl/seed0/config.json", b'{"versions": 1}', "config.json"),
+        (
+            "Catch/rl/seed0/metrics.jsonl",
+            b'{"kind": "train", "env_steps": 1, "wall_s": "x"}\n',
+            "wall_s is not",
+        ),
+    ],
+)
+def test_what_is_not_what_training_writes_is_named(runs, tmp_path, file, content, message):
+    shutil.copytree(runs, tmp_path / "runs")
+    (tmp_path / "runs" / file).write_bytes(content)
+    with pytest.raises(ConfigError, match=message):
+        build(tmp_path / "runs", force=True)
+
+
+def test_whether_a_run_is_finished():
+    from experiments.reporting.numbers import finished
+
+    def run(evals, trains, **values):
+        rows = [{"kind": "eval", "env_steps": step, "eval/return_mean": 1.0} for step in evals]
+        rows += [{"kind": "train", "env_steps": step} for step in trains]
+        return RunData("", "Catch", "a", 0, Config(steps=250, eval_every=100, log_every=50, **values), rows)
+
+    assert finished(run([0, 100, 200], [50, 100, 150, 200, 250]))
+    assert not finished(run([0, 100, 200], [50, 100, 150, 200]))  # the last row of training is missing
+    assert not finished(run([0, 100], [250]))  # the last evaluation is
+    assert finished(run([0, 100], [100], stop_at_return=1.0))
+    assert finished(run([], [250], mode="pretrain"))
+
+
+@pytest.mark.parametrize(("arms", "sizes"), [(6, [6]), (7, [4, 4]), (14, [6, 6, 4])])
+def test_arms_are_drawn_in_groups_with_the_baseline(arms, sizes):
+    from experiments.reporting.gallery import groups
+
+    names = [f"arm{i}" for i in range(arms)]
+    found = groups(names, "arm3")
+    assert [len(group) for group in found] == sizes
+    assert all("arm3" in group for group in found) and set(sum(found, [])) == set(names)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_large_pictures_are_made_smaller(tmp_path, noise):
+    import base64
+    import io
+
+    from PIL import Image
+
+    from experiments.reporting import pictures
+
+    rng = np.random.default_rng(0)
+    frames = rng.integers(0, 256, (40, 42, 42), dtype=np.uint8) if noise else np.zeros((40, 42, 42), np.uint8)
+    path = plots.gif(frames, tmp_path / "play.gif", scale=2)
+    limit = 25_000 if noise else path.stat().st_size
+    found = pictures.taken(path, limit)
+    with Image.open(io.BytesIO(base64.b64decode(found.source.partition(",")[2]))) as image:
+        assert found.bytes <= limit and image.size == ((42, 42) if noise else (84, 84))
+        # Every second frame, for twice as long each, and the first ones of these.
+        if noise:
+            assert image.info["duration"] == 140 and 5 < image.n_frames < 20
+            np.testing.assert_array_equal(np.asarray(image.convert("L")), frames[0])
+    assert pictures.taken(tmp_path / "none.gif", limit) is None
+
+
+def parsed(*arguments):
+    values = flags.FlagValues()
+    report.define_flags(values)
+    config_flags.parse(["report", *map(str, arguments)], values, "runs")
+    return values
+
+
+def test_the_command_line(runs, tmp_path, capsys):
+    out = tmp_path / "made/report.html"
+    assert report.report(parsed(runs, f"--out={out}", "--nomedia", "--baseline=rl")) == out
+    written = out.read_text()
+    assert written.startswith("<!doctype html>") and [p.name for p in out.parent.iterdir()] == ["report.html"]
+    with pytest.raises(ConfigError, match="exists; .*--overwrite"):
+        report.report(parsed(f"--out={out}", f"--runs={runs}"))
+    assert parsed(f"--out={out}", runs)["runs"].value == str(runs)
+    for wrong, message in (
+        ([runs, runs], "unexpected argument"),
+        ([f"--runs={runs}", runs], "unexpected argument"),
+        ([runs, "--ovewrite"], "did you mean --overwrite"),
+    ):
+        with pytest.raises(SystemExit) as ended:
+            parsed(*wrong)
+        assert ended.value.code == 2 and message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "--runs: missing"),
+        (["."], "--out: missing"),
+        ([".", "--out=a.txt"], "must end in .html"),
+        ([".", "--out=a/b\n.html"], "has the character"),
+        ([".", "--out=file/a.html"], "not a directory"),
+        (["none", "--out=a.html"], "--runs=none: no such directory"),
+        ([".", "--out=a.html"], "no run directory"),
+        ([".", "--out=a.html", "--reach=Pong"], "must be GAME=SCORE"),
+        ([".", "--out=a.html", "--reach=Pong=nan"], "must be GAME=SCORE"),
+    ],
+)
+def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match=message):
+        report.report(parsed(*arguments))
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.skipif(not browser.installed(), reason="needs chromium and chromedriver")
+def test_in_a_browser(runs, text, tmp_path):
+    path = tmp_path / "report.html"
+    path.write_text(text)
+    desktop, phone = browser.render(path)
+    assert (desktop.width, phone.width) == (1280, 390) and desktop.images[0] == 9
+    assert browser.problems(desktop) == browser.problems(phone) == []
+    # What it is to find, it finds.
+    wide = '<div style="width: 2000px">x</div><img src="http://127.0.0.1:9/x.png"><script>x()</script>'
+    path.write_text(f"<!doctype html><title>x</title>{wide}")
+    (found,) = browser.render(path, [390])
+    lines = " ".join(browser.problems(found))
+    assert "wide: <div" in lines and "asks for http://127" in lines and "x is not defined" in lines
