@@ -136,15 +136,12 @@ def run_sweep(
 ) -> Outcome:
     """Runs those of these runs that are missing or broken; shows them on stderr.
 
-    They are added to the sweep in `root`, whose other runs are left alone.
-
     Args:
-        root: of the sweep; made if need be.
+        root: of the sweep, whose other runs are left alone; made if need be.
         runs: from `plan.plan`.
         launcher: one of `LAUNCHERS`.
         workers: runs at once; None: as many as there is room for.
-        retries: how often a run that crashed is gone on with; a bad setting, a full disk and a loss that is
-            not finite are no crashes.
+        retries: how often a run that crashed is gone on with: no bad setting, full disk or infinite loss.
         cpus_per_run: cores that a run keeps to. Roundings, and so results, may depend on it.
         gpus_per_run: of one GPU or several, for Ray.
         ray_address: of a Ray cluster; None starts one on this machine.

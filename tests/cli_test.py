@@ -284,6 +284,7 @@ def test_a_config_that_the_loop_refuses_leaves_nothing(capsys, loop, tmp_path, m
 
 
 CATCH = ["--game=Catch", "--encoder=tiny", "--frame_size=42", "--steps=500", "--checkpoint_every=100"]
+CATCH += ["--nodiagnostics"]
 
 
 def _checkpoint(out, env_steps, ended=False):

@@ -1,6 +1,7 @@
 """srl_jax/diagnostics: the measures against hand-worked numbers, and what they may not change."""
 
 import json
+import threading
 from types import SimpleNamespace
 
 import jax
@@ -241,7 +242,7 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     config = Config(**{**SMALL, "diagnostics": True, "eval_every": 60})
     lines = []
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
-    functions = SimpleNamespace(encode=encode, decode={}, others=(), conflict=None)
+    functions = SimpleNamespace(encode=encode, decode={}, others=(), conflict=None, lock=threading.Lock())
     params = {"encoder": {"w": np.float32(0.5)}, "heads": {}}
     state = TrainState(params, {}, None, np.int32(0), None)
 

@@ -136,7 +136,7 @@ def test_a_seed_keeps_what_it_can_go_on_from_until_all_have_ended(tmp_path, monk
 
     monkeypatch.setattr(loop.Run, "save_parameters", late)
     monkeypatch.setattr(checkpoint, "slim", slimming)
-    train_seeds(Config(**CONFIG), [7, 3], outs, progress=False)
+    train_seeds(Config(**CONFIG, diagnostics=False), [7, 3], outs, progress=False)
     assert there == [[True, True]] * 2
 
 
@@ -154,6 +154,7 @@ def test_a_seed_that_ends_early_ends_all(tmp_path, monkeypatch, error):
     for out in outs:
         out.mkdir()
     changes = {"mode": "rl_only", "objectives": (), "srl_every": 1, "checkpoint_every": 40}
+    changes["diagnostics"] = False
     config = Config(**CONFIG | changes)
     run = lambda: train_seeds(config, [0, 1], outs, progress=False)  # noqa: E731
     if isinstance(error, ConfigError):

@@ -28,6 +28,7 @@ def config(**values: Any) -> Config:
         "log_every": 60,
         "checkpoint_every": 150,
         "slow_update_every": 7,
+        "diagnostics": False,
     }
     return resolve(Config(**{**small, **values}), rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
 

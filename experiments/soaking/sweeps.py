@@ -91,7 +91,9 @@ def until_done(
         try:
             # Long enough for something to begin, and short enough for the kills to fall within the sweep.
             last = sum(counts) >= kills
-            _, errors = process.communicate(timeout=None if last else draw.uniform(2.0, 5.0 + seconds / 8))
+            _, errors = process.communicate(
+                timeout=None if last else draw.uniform(2.0, min(5.0 + seconds / 8, 30.0))
+            )
             if process.returncode:
                 raise RuntimeError(f"status {process.returncode}: {errors[-2000:]}")
             return counts[0], counts[1]

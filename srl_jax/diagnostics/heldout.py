@@ -1,5 +1,6 @@
 """The observations that every run of a game is measured on: the same for all arms and seeds."""
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -55,33 +56,53 @@ def collect(config: Config, horizon: int) -> HeldOut:
     Args:
         config: a run's.
         horizon: steps in a window, K.
+
+    Returns:
+        Arrays that nobody may write to: seeds of one process share them.
     """
-    steps = WINDOWS * STRIDE // ENVS
+    protocol = Protocol(
+        config.game, config.frame_size, config.frame_stack, config.sticky_actions, config.noop_max
+    )
+    return _collect(protocol, horizon, WINDOWS)
+
+
+class Protocol(NamedTuple):
+    """What a game's observations depend on; see `srl_jax.config.Config`."""
+
+    game: str
+    frame_size: int
+    frame_stack: int
+    sticky_actions: float
+    noop_max: int
+
+
+@functools.lru_cache(maxsize=1)
+def _collect(protocol: Protocol, horizon: int, number: int) -> HeldOut:
+    steps = number * STRIDE // ENVS
     env = envs.make(
-        config.game,
+        protocol.game,
         num_envs=ENVS,
         seed=seed_for(SEED, "held out", "environments"),
-        frame_size=config.frame_size,
-        sticky_actions=config.sticky_actions,
-        noop_max=config.noop_max,
+        frame_size=protocol.frame_size,
+        sticky_actions=protocol.sticky_actions,
+        noop_max=protocol.noop_max,
     )
     rng = np.random.default_rng(seed_for(SEED, "held out", "policy"))
     # In each environment one of every STRIDE steps, but none in the last ones.
     wanted = np.arange(0, steps, STRIDE) + rng.integers(0, STRIDE, (ENVS, steps // STRIDE))
     actions = rng.integers(0, env.single_action_space.n, (steps + STRIDE, ENVS), dtype=np.int32)
-    order = rng.permutation(WINDOWS)
+    order = rng.permutation(number)
 
     replay = Replay(
         # As many slots as observations: every episode has one more of them than it has steps.
-        capacity=ENVS * (2 * len(actions) + config.frame_stack + horizon),
+        capacity=ENVS * (2 * len(actions) + protocol.frame_stack + horizon),
         num_streams=ENVS,
         frame_shape=env.single_observation_space.shape,
-        stack=config.frame_stack,
+        stack=protocol.frame_stack,
         horizon=horizon,
-        gamma=config.gamma,
         alpha=0.0,
     )
-    reader = _reader(config, env)
+    reader = _reader(protocol, env)
     everyone = np.arange(ENVS)
     episodes, next_episode = np.arange(ENVS), ENVS
     length = np.zeros(ENVS, int)
@@ -113,13 +134,13 @@ def collect(config: Config, horizon: int) -> HeldOut:
             length[over] = 0
     env.close()
     indices, states, of_episode = zip(*[rows[i] for i in order], strict=True)
-    return HeldOut(
-        replay.gather(np.array(indices)),
-        np.array(states, np.float64).reshape(WINDOWS, -1)[:, : len(reader.variables)],
-        reader.variables,
-        np.array(of_episode),
-        reader.problem,
+    states = np.array(states, np.float64).reshape(number, -1)[:, : len(reader.variables)]
+    held_out = HeldOut(
+        replay.gather(np.array(indices)), states, reader.variables, np.array(of_episode), reader.problem
     )
+    for array in (*held_out.windows, held_out.states, held_out.episodes):
+        array.setflags(write=False)
+    return held_out
 
 
 class _Unknown:
@@ -163,13 +184,13 @@ class _Told(_Unknown):
 class _Memory(_Unknown):
     """The labelled bytes of the memory of emulators that are in step with the environments."""
 
-    def __init__(self, env, config: Config, labels: dict[str, int]):
+    def __init__(self, env, protocol: Protocol, labels: dict[str, int]):
         from srl_jax.envs.ram import OutOfStep, Twin
 
         self.variables, self._bytes = tuple(labels), list(labels.values())
         self._env, self._out_of_step = env, OutOfStep
         self._twins = [
-            Twin(config.game, sticky_actions=config.sticky_actions, noop_max=config.noop_max)
+            Twin(protocol.game, sticky_actions=protocol.sticky_actions, noop_max=protocol.noop_max)
             for _ in range(env.num_envs)
         ]
 
@@ -201,8 +222,8 @@ class _Memory(_Unknown):
             self.variables = ()
 
 
-def _reader(config: Config, env) -> _Unknown:
-    if config.game not in ATARI_57:
+def _reader(protocol: Protocol, env) -> _Unknown:
+    if protocol.game not in ATARI_57:
         return _Told(env)
-    labels = ram_labels(config.game)
-    return _Memory(env, config, labels) if labels else _Unknown()
+    labels = ram_labels(protocol.game)
+    return _Memory(env, protocol, labels) if labels else _Unknown()

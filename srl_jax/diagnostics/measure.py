@@ -86,8 +86,9 @@ class Diagnostics:
             window: a batch from replay, for gradients; None for none.
             hyper: of its next update.
         """
-        began = time.perf_counter()
-        values = self._measure(state, env_steps, window, hyper)
+        with self._functions.lock:
+            began = time.perf_counter()
+            values = self._measure(state, env_steps, window, hyper)
         plain = {f"diag/{name}": _plain(value) for name, value in values.items()}
         return plain | {"wall_diag_s": round(time.perf_counter() - began, 3)}
 
