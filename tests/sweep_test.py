@@ -252,6 +252,8 @@ def test_runs_keep_to_cores_of_their_own(stubs):
     if len(os.sched_getaffinity(0)) > 2:
         assert found[0] != found[1]
     # A status from elsewhere.
+    assert states.alive(records[0]) and not states.alive(records[0]._replace(host="elsewhere"))
+    assert not states.alive(records[0]._replace(pid=2**30))
     lines = table.status(stubs.root, manifest.read(stubs.root), 1)
     assert "0 of 3 runs done, 2 running, 1 waiting" in lines[0]
     assert lines[2].split()[:5] == [A, records[0].host, "core", str(records[0].cores[0]), "0/500"]
