@@ -35,7 +35,7 @@ def drift_matrix(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike, tit
     from matplotlib.ticker import EngFormatter
 
     found = {name: of_rows.drift_matrix(rows, name) for name in of_rows.drift_names(rows)}
-    found = {n: (steps, m) for n, (steps, m) in found.items() if len(steps) > 1 and np.nanmax(m) > 0}
+    found = {n: (steps, m) for n, (steps, m) in found.items() if len(steps) > 1 and (m > 0).any()}
     if not found:
         return None
     figure = _figure(4.6 * len(found) + 0.4, 4.3)

@@ -39,6 +39,10 @@ def test_rows_as_training_writes_them(tmp_path):
         ({"eval/returns": [1e39]}, "eval/returns"),
         ({"loss/rl": {}}, "loss/rl"),
         ({"grad_norm": [1.0]}, "grad_norm"),
+        ({"diag/effective_rank": "2"}, "diag/effective_rank"),
+        ({"diag/drift/cka": [0.5, [1.0]]}, "diag/drift/cka"),
+        ({"diag/drift/steps": [1.5]}, "diag/drift/steps"),
+        ({"diag/drift/steps": 5}, "diag/drift/steps"),
     ],
 )
 def test_other_rows_are_refused_with_their_line(change, reason, tmp_path):

@@ -704,6 +704,8 @@ def _configs() -> Iterator[Case]:
         "the mean is a list": {"eval/return_mean": [1.0]},
         "the mean is an object": {"eval/return_mean": {}},
         "returns are text": {"eval/returns": "12"},
+        "drift is text": {"diag/drift/steps": "0"},
+        "drift is of nothing": {"diag/drift/steps": [0], "diag/decoder_now/x": 1.0, "diag/encoder_now/x": {}},
         "returns are lists": {"eval/returns": [[1.0], [1.0, 2.0]]},
         "returns are an object": {"eval/returns": {"0": 1.0}},
         "returns are one number": {"eval/returns": 5},
