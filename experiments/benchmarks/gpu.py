@@ -94,7 +94,7 @@ def whole_run(seconds: float) -> dict[str, float]:
                 seconds = []
                 for _ in range(2):  # the first compiles
                     start = time.perf_counter()
-                    run.start_evaluation(run.state.params, run.env_steps, run.updates)
+                    run.start_evaluation(run.state.params, run.env_steps, run.updates, run.diagnose())
                     run.finish_evaluation()
                     seconds.append(time.perf_counter() - start)
         finally:

@@ -236,6 +236,17 @@ def last_line(root: Path, name: str) -> str:
     return "".join(c for c in line.removeprefix("error: ") if c.isprintable())
 
 
+def alive(record: Record) -> bool:
+    """Whether the process of a run is still there; False, too, where it is another machine's."""
+    if record.ended is not None or record.host != host():
+        return False
+    try:
+        os.kill(record.pid, 0)
+    except (OSError, OverflowError):
+        return False
+    return True
+
+
 def host() -> str:
     """The name of this machine."""
     return platform.node()

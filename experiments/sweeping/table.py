@@ -241,8 +241,8 @@ def view_of_files(root: Path, entries: Mapping[str, Entry]) -> View:
         )
         if state.kind == "done":
             view.done.append(name)
-        elif state.kind == "busy":
-            view.running.append(name)
+        elif state.kind == "busy" or (record is not None and states.alive(record)):
+            view.running.append(name)  # in its first seconds a process does not hold the directory yet
         elif record is not None and record.ended is not None and record.status and record.reason:
             view.failed[name] = record.reason
         elif bad:
