@@ -1,7 +1,7 @@
 """The pictures of a report, in their sections."""
 
 import functools
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -113,40 +113,39 @@ def _legend(report: Report, seeds: dict[str, int]) -> Markup:
 
 def playing(report: Report) -> Content:
     """The last evaluation of each arm's first seed."""
-    if not report.media:
-        return tag("p", "Left out (--no_media).", class_="note")
     limit = _limit(report)
-    parts: list = []
-    for game in report.games:
-        cells = []
-        for run in _first_runs(report, game):
-            if picture := pictures.taken(run.path / "figures" / "play.gif", limit):
-                caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}"]
-                cells.append(figure(picture.source, caption, f"{run_name(run)}, playing"))
-        if cells:
-            parts += [tag("h3", game), tag("div", cells, class_="grid play")]
-    note = "The first games of the last evaluation, as the agent sees them."
-    return [tag("p", note, class_="note"), parts] if parts else None
+
+    def cells(run: RunData) -> list[Markup]:
+        picture = pictures.taken(run.path / "figures" / "play.gif", limit)
+        caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}"]
+        return [figure(picture.source, caption, f"{run_name(run)}, playing")] if picture else []
+
+    return _by_game(report, cells, "play", "The first games of the last evaluation, as the agent sees them.")
 
 
 def panels(report: Report) -> Content:
     """What the objectives make of observations, of each arm's first seed."""
-    if not report.media:
-        return tag("p", "Left out (--no_media).", class_="note")
     limit = _limit(report)
-    parts: list = []
-    for game in report.games:
-        cells = []
-        for run in _first_runs(report, game):
-            for path in _panels(run):
-                picture = pictures.taken(path, limit)
-                caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}: {path.stem}"]
-                cells.append(figure(picture.source, caption, f"{run_name(run)}: {path.stem}", picture.size))
-        if cells:
-            parts += [tag("h3", game), tag("div", cells, class_="grid media")]
+
+    def cell(run: RunData, path: Path) -> Markup:
+        picture = pictures.taken(path, limit)
+        caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}: {path.stem}"]
+        return figure(picture.source, caption, f"{run_name(run)}: {path.stem}", picture.size)
+
     note = (
         "Observations from replay: what went in, what should come out, what came out, and how far off it is."
     )
+    return _by_game(report, lambda run: [cell(run, path) for path in _panels(run)], "media", note)
+
+
+def _by_game(report: Report, cells: Callable[[RunData], list[Markup]], kind: str, note: str) -> Content:
+    """A grid a game of what each arm's first seed has to show; None where none has anything."""
+    if not report.media:
+        return tag("p", "Left out (--no_media).", class_="note")
+    parts: list = []
+    for game in report.games:
+        if shown := [cell for run in _first_runs(report, game) for cell in cells(run)]:
+            parts += [tag("h3", game), tag("div", shown, class_=f"grid {kind}")]
     return [tag("p", note, class_="note"), parts] if parts else None
 
 
