@@ -340,3 +340,34 @@ def test_labelled_bytes_hold_what_is_seen(monkeypatch):
     middle = (seen * np.arange(64)).sum(1)[there] / seen.sum(1)[there]
     assert there.mean() > 0.8
     assert np.corrcoef(middle, held_out.states[there, 0])[0, 1] > 0.95
+
+
+def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
+    monkeypatch.setattr(heldout, "WINDOWS", 64)
+    config = Config(**{**SMALL, "diagnostics": True, "eval_every": 60})
+    lines = []
+
+    def decode(head, z, window):  # the errors are the decoder's number, whatever the latent
+        image = np.zeros((len(z), 2, 2, 2), np.float32)
+        return np.full(len(z), head["w"]), image, image
+
+    encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
+    functions = SimpleNamespace(
+        encode=encode, decode={"x": decode}, others=(), conflict=None, lock=threading.Lock()
+    )
+    diagnostics = Diagnostics(config, functions, 1, tmp_path, lines.append)
+
+    def measure(step):
+        params = {"encoder": {"w": np.float32(0.5)}, "heads": {"x": {"w": np.float32(step)}}}
+        values = diagnostics.measure(TrainState(params, {}, None, np.int32(0), None), step, None, None)
+        arguments = {"num_actions": 3, "env_steps": step, "updates": 0, "keep": 0, "folder": "encoders"}
+        checkpoint.save(tmp_path, diagnostics.parts(params), config, **arguments)
+        return [values[f"diag/{which}/x"] for which in ("decoder_now", "encoder_now")]
+
+    assert measure(0) == [[0.0], []]
+    assert measure(60) == [[60.0, 60.0], [0.0]]
+    # That of 0 was read before, so its latents are known; its decoder is not any more.
+    path = tmp_path / "encoders" / "000000000" / "params.msgpack"
+    path.write_bytes(path.read_bytes()[:-1])
+    assert measure(120) == [[120.0] * 3, [None, 60.0]] and len(lines) == 1
+    assert measure(180) == [[180.0] * 3, [60.0, 120.0]] and len(lines) == 1

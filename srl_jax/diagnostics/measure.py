@@ -1,6 +1,7 @@
 """All diagnostics of one run."""
 
 import functools
+import math
 import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -15,7 +16,6 @@ from srl_jax.diagnostics import measures
 from srl_jax.diagnostics.device import Functions
 from srl_jax.diagnostics.heldout import HeldOut, collect
 from srl_jax.errors import ConfigError
-from srl_jax.optim import real_copy
 from srl_jax.types import Params, TrainState, Window
 from srl_jax.update import Hyper
 
@@ -30,13 +30,13 @@ CROSSED = 32
 class Kept(NamedTuple):
     """An epoch that drift is measured against.
 
+    Its decoders stay on disk: those of `sac_ae` have 40 MB each.
+
     Attributes:
-        heads: {objective: parameters of its decoder}.
         latents: of the held-out observations, float32 [N, D].
         gram: of these, see `measures.centred_gram`.
     """
 
-    heads: dict[str, Params]
     latents: np.ndarray
     gram: np.ndarray
 
@@ -78,7 +78,7 @@ class Diagnostics:
     ) -> dict[str, float | None | list]:
         """The values of an "eval" row, JSON's own, and seconds as `wall_diag_s`; changes nothing of the run.
 
-        What an epoch is kept for is kept in memory here; `parts` is what belongs into `encoders/`.
+        Of an epoch that is kept, latents are kept in memory here; `parts` is what belongs into `encoders/`.
 
         Args:
             state: of the run.
@@ -101,8 +101,8 @@ class Diagnostics:
 
     def _measure(self, state: TrainState, env_steps: int, window: Window | None, hyper: Hyper):
         held_out, params = self._held_out, self.parts(state.params)
-        now = self._keep(params)
-        kept = self._kept_before(env_steps, state.params)
+        now = self._keep(params["encoder"])
+        kept = self._kept_before(env_steps, params)
         z = now.latents
         values: dict[str, Any] = {"drift/steps": list(kept)}
         if not np.isfinite(z).all():
@@ -116,8 +116,8 @@ class Diagnostics:
         }
         if self._config.frame_stack > 1:
             values["moving_share"] = measures.moving_share(held_out.observations)
-        for name in params["heads"]:
-            values |= self._decoded(name, now, list(kept.values()))
+        if params["heads"]:
+            values |= self._decoded(params, now, kept)
         if window is not None and self._functions.conflict is not None:
             found = jax.device_get(self._functions.conflict(state._replace(opt_state=None), window, hyper))
             for name, (cosine, ratio) in found.items():
@@ -133,24 +133,29 @@ class Diagnostics:
             self._kept[env_steps] = now
         return values
 
-    def _decoded(self, name: str, now: Kept, kept: list[Kept]) -> dict[str, Any]:
-        """The errors of one objective's decoders."""
+    def _decoded(self, params: Params, now: Kept, kept: dict[int, Kept]) -> dict[str, Any]:
+        """The errors of the objectives' decoders."""
 
-        def crossed(head: Params, latents: np.ndarray) -> float:
+        def crossed(name: str, head: Params, latents: np.ndarray) -> float:
             return float(np.concatenate([e for e, _, _ in self._decode(name, head, latents, CROSSED)]).mean())
 
-        head = now.heads[name]
-        errors, targets, outputs = (
-            np.concatenate(x) for x in zip(*self._decode(name, head, now.latents, DECODED), strict=True)
-        )
-        itself = float(errors[:CROSSED].mean())
-        values = {
-            f"decoder_now/{name}": [crossed(head, then.latents) for then in kept] + [itself],
-            f"encoder_now/{name}": [crossed(then.heads[name], now.latents) for then in kept],
-        }
-        if targets.shape[-1] == 2:  # else nothing tells what moves
-            found = measures.moving_errors(targets[..., 0], targets[..., 1], outputs[..., 1])
-            values |= {f"error/{name}/{what}": value for what, value in found.items()}
+        values: dict[str, Any] = {}
+        for name, head in params["heads"].items():
+            errors, targets, outputs = (
+                np.concatenate(x) for x in zip(*self._decode(name, head, now.latents, DECODED), strict=True)
+            )
+            itself = float(errors[:CROSSED].mean())
+            values[f"decoder_now/{name}"] = [crossed(name, head, then.latents) for then in kept.values()]
+            values[f"decoder_now/{name}"] += [itself]
+            values[f"encoder_now/{name}"] = []
+            if targets.shape[-1] == 2:  # else nothing tells what moves
+                found = measures.moving_errors(targets[..., 0], targets[..., 1], outputs[..., 1])
+                values |= {f"error/{name}/{what}": value for what, value in found.items()}
+        for step in kept:
+            then = self._read(step, params)
+            for name in params["heads"]:
+                error = crossed(name, then["heads"][name], now.latents) if then else math.nan
+                values[f"encoder_now/{name}"].append(error)
         return values
 
     def _decode(self, name: str, head: Params, latents: np.ndarray, number: int) -> list[tuple]:
@@ -158,35 +163,34 @@ class Diagnostics:
         decode, windows = self._functions.decode[name], self._held_out.windows
         return [jax.device_get(decode(head, latents[p], _rows(windows, p))) for p in _parts(number)]
 
-    def _keep(self, params: Params) -> Kept:
+    def _keep(self, encoder: Params) -> Kept:
         observations = self._held_out.observations
         latents = np.concatenate(
             [
-                np.asarray(self._functions.encode(params["encoder"], observations[part]))
+                np.asarray(self._functions.encode(encoder, observations[part]))
                 for part in _parts(len(observations))
             ]
         )
-        return Kept(params["heads"], latents, measures.centred_gram(latents))
+        return Kept(latents, measures.centred_gram(latents))
 
     def _kept_before(self, env_steps: int, template: Params) -> dict[int, Kept]:
-        """The kept epochs, oldest first; what a process before this one has kept is read from disk.
-
-        One that cannot be read is named, once, and left out.
-        """
+        """The kept epochs, oldest first; what a process before this one has kept is read from disk."""
         before = [step for step in self.steps if step < env_steps]
         for step in before:
-            if step not in self._kept:
-                try:
-                    self._kept[step] = self._keep(real_copy(self._load(step, self.parts(template))))
-                except ConfigError as error:
-                    self._kept[step] = None
-                    self._say(f"drift is measured without the encoder of {step} env steps: {error}")
+            if step not in self._kept and (parts := self._read(step, template)):
+                self._kept[step] = self._keep(parts["encoder"])
         return {step: self._kept[step] for step in before if self._kept[step] is not None}
 
-    def _load(self, step: int, template: Params) -> Params:
+    def _read(self, step: int, template: Params) -> Params | None:
+        """What was kept of an epoch; None, once named and left out from then on, if it cannot be read."""
         path = self._folder / f"{step:09d}"
-        tree = checkpoint.load(checkpoint.read_manifest(path))
-        return checkpoint.load_into(template, tree, str(path))
+        try:
+            tree = checkpoint.load(checkpoint.read_manifest(path))
+            return checkpoint.load_into(template, tree, str(path))
+        except ConfigError as error:
+            self._kept[step] = None
+            self._say(f"drift is measured without the encoder of {step} env steps: {error}")
+            return None
 
 
 def kept_steps(config: Config) -> tuple[int, ...]:
