@@ -47,7 +47,7 @@ train: install ## train on Pong for about three minutes (two cores), into a new 
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .
 
-soak: install ## try to break what is promised about killed runs, disks and inputs (an hour and a half)
+soak: install ## try to break what is promised about killed runs, disks and inputs (two hours and more)
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[soak]'
 	@$(VENV)/bin/python -m experiments.soak $(ARGS)
 
