@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 from experiments.presets import PRESETS
 from srl_jax.config import INFOS
 from srl_jax.data import thesis_curve
-from srl_jax.envs import ATARI_57, CATCH
+from srl_jax.envs import CATCH
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text
@@ -122,8 +122,6 @@ FIGURES: dict[str, Figure] = {
     )
 }
 """The thesis' figures; the arms' names are its presets'."""
-
-GAMES = (*CATCH, *ATARI_57)
 
 
 def figures_named(text: str) -> list[Figure]:

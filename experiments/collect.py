@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments.draw import read_rows
-from srl_jax.config import INFOS, Config
+from srl_jax.config import INFOS, Config, difference
 from srl_jax.errors import ConfigError
 
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
@@ -101,10 +101,11 @@ def check_arms(runs: Sequence[RunData]) -> None:
     Raises:
         ConfigError: two differ in more; says in what.
     """
+    names = [name for name in INFOS if name not in OF_A_SEED]
     for game, arms in grouped(runs).items():
         for arm, members in arms.items():
             for run in members[1:]:
-                if differing := differences(members[0].config, run.config, without=OF_A_SEED):
+                if differing := difference(members[0].config, run.config, names):
                     raise ConfigError(
                         f"{run.path}: of the same arm, {arm} on {game}, as {members[0].path}, but {differing}"
                     )
@@ -129,18 +130,8 @@ def check_protocols(runs: Sequence[RunData], *, force: bool = False) -> list[str
         if not len(steps_and_returns(run)[0]):
             continue
         reference = first.setdefault(run.game, run)
-        if differing := differences(reference.config, run.config, only=PROTOCOL):
+        if differing := difference(reference.config, run.config, PROTOCOL):
             found.append(f"{run.path}: another protocol than {reference.path}: {differing}")
     if found and not force:
         raise ConfigError(f"{found[0]}; --force compares them all the same")
     return found
-
-
-def differences(
-    there: Config, here: Config, *, only: Sequence[str] = tuple(INFOS), without: Sequence[str] = ()
-) -> str:
-    """What differs, `steps is 1000 there and 2000 here, ...`; "" if nothing of these fields does."""
-    names = [name for name in only if name not in without and getattr(there, name) != getattr(here, name)]
-    return ", ".join(
-        f"{name} is {getattr(there, name)} there and {getattr(here, name)} here" for name in names
-    )

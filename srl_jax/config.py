@@ -12,7 +12,7 @@ import os
 import platform
 import subprocess
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -287,9 +287,9 @@ def resolve(
     )
 
 
-def difference(there: Config, here: Config) -> str:
-    """What differs between two configurations, `steps is 1000 there and 2000 here, ...`; "" if nothing."""
-    pairs = ((name, getattr(there, name), getattr(here, name)) for name in INFOS)
+def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS)) -> str:
+    """What differs of these fields, `steps is 1000 there and 2000 here, ...`; "" if nothing."""
+    pairs = ((name, getattr(there, name), getattr(here, name)) for name in names)
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
 
 
