@@ -144,6 +144,16 @@ def test_a_probe_finds_what_is_linear_in_the_latent_and_nothing_else():
     assert np.isnan(measures.probe(z, states, np.zeros(400, int))).all()
 
 
+def test_a_unit_that_hardly_moves_does_not_decide_a_probe():
+    # On the episodes of the fit it is a thousandth of noise, on the others all of it.
+    for seed in range(4):  # without a floor, R^2 is -0.1 to -307
+        rng = np.random.default_rng(seed)
+        z, episodes = rng.normal(size=(400, 30)), np.repeat(np.arange(20), 20)
+        states = z @ rng.normal(size=(30, 1)) + rng.normal(size=(400, 1))
+        z[:, 7] = np.where(episodes % 2 == 0, 1e-3, 1.0) * rng.normal(size=400)
+        assert measures.probe(z, states, episodes)[0] > 0.5
+
+
 def test_a_probe_leaves_out_whole_episodes():
     # Each episode has a mark of its own in the latent, and a level of its own in the state: fitting the marks
     # says nothing of other episodes. Where single observations are left out, it looks perfect.

@@ -12,6 +12,9 @@ levels of 255. In Pong and Catch 0.5 % of the pixels do, in front of CatchDistra
 RIDGES = tuple(10.0**k for k in range(-4, 4))
 """What a probe's regularisation is chosen from, in units of the mean squared norm of an observation's
 standardised latent."""
+QUIET = 0.1
+"""A probe gives a unit at most the scale that one of this standard deviation would have, in units of the root
+mean square over all units: see `probe`."""
 
 
 def effective_rank(latents: np.ndarray) -> float:
@@ -128,7 +131,9 @@ def probe(latents: np.ndarray, states: np.ndarray, episodes: np.ndarray) -> np.n
 
     Ridge regression from standardised units to standardised variables, fitted on every second episode. Its
     regularisation is the one of `RIDGES` with the smallest error there when each episode is predicted from
-    the others, for each variable: observations of one episode look alike.
+    the others, for each variable: observations of one episode look alike. A unit that hardly moves on those
+    episodes is not blown up to the size of the others (`QUIET`): on a new episode it may be far out, and
+    would decide alone.
 
     Args:
         latents: [N, D].
@@ -147,9 +152,11 @@ def probe(latents: np.ndarray, states: np.ndarray, episodes: np.ndarray) -> np.n
         return scores
     known = (y[fits].std(0) > 0) & (y[~fits].std(0) > 0)
     mean, scale = z[fits].mean(0), z[fits].std(0)
-    z = (z[:, scale > CONSTANT] - mean[scale > CONSTANT]) / scale[scale > CONSTANT]
-    if not (known.any() and z.shape[1]):
+    varies = scale > CONSTANT
+    if not (known.any() and varies.any()):
         return scores
+    scale = scale[varies]
+    z = (z[:, varies] - mean[varies]) / np.maximum(scale, QUIET * np.sqrt((scale**2).mean()))
     y_mean, y_scale = y[fits].mean(0)[known], y[fits].std(0)[known]
     y = (y[:, known] - y_mean) / y_scale
     # The dual form, in the eigenvectors of the inner products: as many unknowns as observations.
