@@ -70,7 +70,7 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
     labels = list(dict.fromkeys(line.label for panel in panels for line in panel.lines))
     colours = {label: plots.COLOURS[i % len(plots.COLOURS)] for i, label in enumerate(labels)}
     width = 4.6 if columns > 1 else 6.4
-    figure = plots._figure(width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)
+    figure = plots.new_figure(width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)
     handles: dict[str, object] = {}
     for i, panel in enumerate(panels):
         axes = figure.add_subplot(rows, columns, i + 1, xlabel=plots.STEPS_LABEL, ylabel="mean return")
@@ -91,7 +91,7 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
                 )
                 handles["the thesis' own, one run each"] = dashed
         _levels(axes, panel.levels, end)
-        plots._count_axis(axes)
+        plots.count_axis(axes)
         axes.set_xlim(0, end)
     known = "the thesis' own, one run each"
     if known in handles:  # last, and in no arm's colour
@@ -117,7 +117,7 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
     )
     legend.get_title().set_parse_math(False)
     figure.suptitle(title, fontsize=11).set_parse_math(False)
-    return plots._save(figure, path)
+    return plots.save(figure, path)
 
 
 def _seeds(panels: Sequence[Panel], label: str) -> str:

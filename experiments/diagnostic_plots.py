@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.plots import COLOURS, STEPS_LABEL, _count_axis, _figure, _log_axis, _save
+from experiments.plots import COLOURS, STEPS_LABEL, count_axis, log_axis, new_figure, save
 from srl_jax.diagnostics import rows as of_rows
 
 WRITTEN_IN = 11
@@ -38,7 +38,7 @@ def drift_matrix(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike, tit
     found = {n: (steps, m) for n, (steps, m) in found.items() if len(steps) > 1 and (m > 0).any()}
     if not found:
         return None
-    figure = _figure(4.6 * len(found) + 0.4, 4.3)
+    figure = new_figure(4.6 * len(found) + 0.4, 4.3)
     figure.suptitle(title, fontsize=10).set_parse_math(False)
     count = EngFormatter(sep="")
     for axes, (name, (steps, matrix)) in zip(
@@ -62,7 +62,7 @@ def drift_matrix(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike, tit
         bar = figure.colorbar(shown, ax=axes, fraction=0.05, pad=0.03)
         bar.set_label("mean squared error", fontsize=8)
         bar.ax.tick_params(labelsize=7)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def diagnostics(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, title: str) -> Path | None:
@@ -76,7 +76,7 @@ def diagnostics(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, titl
         return None
     columns = min(len(panels), 3)
     lines = -(-len(panels) // columns)
-    figure = _figure(3.4 * columns + 0.4, 2.5 * lines + 0.4)
+    figure = new_figure(3.4 * columns + 0.4, 2.5 * lines + 0.4)
     figure.suptitle(title, fontsize=10).set_parse_math(False)
     for i, (name, curves) in enumerate(panels.items()):
         axes = figure.add_subplot(lines, columns, i + 1)
@@ -87,15 +87,15 @@ def diagnostics(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, titl
             axes.plot(at, values, color=COLOURS[number % len(COLOURS)], marker=marker, label=label, **style)
         drawn = [value for _, values in curves.values() for value in values]
         if "ratio" in name and min(drawn) > 0:
-            _log_axis(axes, max(drawn) / min(drawn))
+            log_axis(axes, max(drawn) / min(drawn))
         if len(curves) > 1 or next(iter(curves)) != name:
             for text in axes.legend(fontsize=6, framealpha=0.7, ncols=1 + len(curves) // 7).get_texts():
                 text.set_parse_math(False)
-        _count_axis(axes)
+        count_axis(axes)
         axes.tick_params(labelsize=7)
         if i + columns >= len(panels):
             axes.set_xlabel(STEPS_LABEL, fontsize=8)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def _panels(rows: list[Mapping[str, Any]]) -> dict[str, dict[str, tuple[list, list]]]:

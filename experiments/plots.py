@@ -49,7 +49,7 @@ def learning_curve(
     games = [np.array(row.get("eval/returns") or [np.nan], float) for row in evals]
     counts = sorted({len(game) for game in games if np.isfinite(game).all()})
 
-    figure = _figure(6.4, 4.0)
+    figure = new_figure(6.4, 4.0)
     axes = figure.add_subplot(xlabel=STEPS_LABEL)
     axes.set_title(title, parse_math=False)
     over = f" over {' or '.join(map(str, counts))} games" if counts else ""
@@ -73,11 +73,11 @@ def learning_curve(
         at = np.unique(np.minimum(theirs, end))
         colour = COLOURS[1 + i % (len(COLOURS) - 1)]
         axes.plot(at, np.interp(at, theirs, returns), "--", color=colour, linewidth=1.4, label=label)
-    _count_axis(axes)
+    count_axis(axes)
     if end == 0:  # evaluated before training only: keep the axis from counting in thousandths
         axes.set_xlim(-1, 1)
     axes.legend(loc="best", fontsize=8, framealpha=0.8)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path | None:
@@ -102,7 +102,7 @@ def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path |
         return None
     columns = min(len(curves), 3 if len(curves) != 4 else 2)
     lines = -(-len(curves) // columns)
-    figure = _figure(3.2 * columns + 0.4, 2.3 * lines + 0.3)
+    figure = new_figure(3.2 * columns + 0.4, 2.3 * lines + 0.3)
     for i, (key, at, values) in enumerate(curves):
         axes = figure.add_subplot(lines, columns, i + 1)
         span = len(at) // 25
@@ -121,12 +121,12 @@ def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path |
         name = key.replace("grad_norm", "gradient norm").replace("norm/", "norm, ")
         axes.set_title(name, fontsize=9, parse_math=False)
         if values.min() > 0 and values.max() >= 5 * values.min():
-            _log_axis(axes, values.max() / values.min())
-        _count_axis(axes)
+            log_axis(axes, values.max() / values.min())
+        count_axis(axes)
         axes.tick_params(labelsize=7)
         if i + columns >= len(curves):
             axes.set_xlabel(STEPS_LABEL, fontsize=8)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def image_panel(
@@ -164,7 +164,7 @@ def image_panel(
     top = float(difference.max()) or 1.0
 
     count = len(difference)
-    figure = _figure(1.15 * 4 + 0.9, 1.15 * count + 0.75)
+    figure = new_figure(1.15 * 4 + 0.9, 1.15 * count + 0.75)
     axes = figure.subplots(count, 4, squeeze=False)
     names = ("input", "target", "output", "|output - target|")
     for column, (name, images) in enumerate(zip(names, [*newest, difference], strict=True)):
@@ -179,7 +179,7 @@ def image_panel(
     bar.set_label("absolute difference", fontsize=8)
     bar.ax.tick_params(labelsize=7)
     figure.suptitle(title, fontsize=10).set_parse_math(False)
-    return _save(figure, path)
+    return save(figure, path)
 
 
 def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int = 3) -> Path:
@@ -224,7 +224,7 @@ def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int
     return path
 
 
-def _figure(width: float, height: float):
+def new_figure(width: float, height: float):
     """An empty figure of that size in inches, laid out tightly."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -234,7 +234,7 @@ def _figure(width: float, height: float):
     return figure
 
 
-def _count_axis(axes) -> None:
+def count_axis(axes) -> None:
     """Env steps as 200k or 1.5M, a light grid, no box."""
     from matplotlib.ticker import EngFormatter, MaxNLocator
 
@@ -244,7 +244,8 @@ def _count_axis(axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def _log_axis(axes, span: float) -> None:
+def log_axis(axes, span: float) -> None:
+    """A logarithmic axis of values; the largest is `span` times the smallest."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     axes.set_yscale("log")
@@ -260,7 +261,8 @@ def _folder(path: str | os.PathLike) -> Path:
     return path
 
 
-def _save(figure, path: str | os.PathLike) -> Path:
+def save(figure, path: str | os.PathLike) -> Path:
+    """Writes a figure as a small PNG file, making its directory where there is none; returns the path."""
     from PIL import Image
 
     path = _folder(path)

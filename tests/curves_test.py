@@ -22,7 +22,7 @@ def _panel(game, **lines):
 def drawn(monkeypatch):
     """The figures that would have been saved."""
     figures = []
-    monkeypatch.setattr(plots, "_save", lambda figure, path: figures.append(figure) or path)
+    monkeypatch.setattr(plots, "save", lambda figure, path: figures.append(figure) or path)
     return figures
 
 

@@ -293,8 +293,8 @@ def test_what_is_no_diagnostic_is_refused(values):
 @pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
 def test_drift_is_drawn_as_a_matrix_and_numbers_as_curves(tmp_path, monkeypatch):
     figures = []
-    save = diagnostic_plots._save
-    monkeypatch.setattr(diagnostic_plots, "_save", lambda f, path: figures.append(f) or save(f, path))
+    save = diagnostic_plots.save
+    monkeypatch.setattr(diagnostic_plots, "save", lambda f, path: figures.append(f) or save(f, path))
     rows = rows_of([0, 10, 20])
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     written = draw.draw_run(tmp_path, Config())

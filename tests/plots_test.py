@@ -15,13 +15,13 @@ Image = pytest.importorskip("PIL.Image")
 def drawn(monkeypatch):
     """The figures that the functions under test saved, to look at their parts."""
     figures = []
-    save = plots._save
+    save = plots.save
 
     def keep(figure, path):
         figures.append(figure)
         return save(figure, path)
 
-    monkeypatch.setattr(plots, "_save", keep)
+    monkeypatch.setattr(plots, "save", keep)
     return figures
 
 

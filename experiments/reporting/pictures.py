@@ -189,7 +189,7 @@ def curves(
     small = size[0] < 4
 
     def draw(path: Path) -> None:
-        figure = plots._figure(*size)
+        figure = plots.new_figure(*size)
         axes = figure.add_subplot()
         for place, curve in lines.items():
             colour, line = style(place)
@@ -206,13 +206,13 @@ def curves(
                 textcoords="offset points", fontsize=7, color="#555555", parse_math=False,
             )  # fmt: skip
         axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
-        plots._count_axis(axes)
+        plots.count_axis(axes)
         axes.tick_params(labelsize=7 if small else 9)
         axes.set_xlabel(plots.STEPS_LABEL, fontsize=7.5 if small else 9)
         axes.set_ylabel(label, fontsize=9)
         if limits is not None:
             axes.set_ylim(*limits)
-        plots._save(figure, path)
+        plots.save(figure, path)
 
     return drawn(draw)
 
@@ -231,7 +231,7 @@ def differences(
 
     def draw(path: Path) -> None:
         arms = list(next(iter(panels.values())))
-        figure = plots._figure(5.4, 1.1 + 0.3 * len(arms))
+        figure = plots.new_figure(5.4, 1.1 + 0.3 * len(arms))
         figure.suptitle(title, fontsize=11).set_parse_math(False)
         grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (name, found) in zip(grid, panels.items(), strict=True):
@@ -249,6 +249,6 @@ def differences(
             axes.tick_params(axis="x", labelsize=8)
             axes.margins(x=0.08)
         figure.supxlabel(f"difference from {baseline}", fontsize=8).set_parse_math(False)
-        plots._save(figure, path)
+        plots.save(figure, path)
 
     return drawn(draw)
