@@ -240,6 +240,11 @@ def count_axis(axes) -> None:
 
     axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.xaxis.set_major_locator(MaxNLocator(6, integer=True))
+    plain(axes)
+
+
+def plain(axes) -> None:
+    """A light grid, no box."""
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
 

@@ -145,7 +145,7 @@ def test_nothing_is_asked_for_from_outside(page):
     assert policy.startswith("default-src 'none'")
     ids = [attributes["id"] for _, attributes in page.attributes if "id" in attributes]
     links = [attributes["href"] for tag, attributes in page.attributes if tag == "a"]
-    assert links == [f"#{name}" for name in ids] and len(set(ids)) == len(ids) == 11
+    assert links == [f"#{name}" for name in ids] and len(set(ids)) == len(ids) == 12
     assert all(a["alt"] for tag, a in page.attributes if tag == "img")
 
 
@@ -187,6 +187,24 @@ def test_the_sentences_say_what_the_intervals_say(page):
     assert (
         "1 arm without an interval" in page.text and "contains the truth in about 67 % of cases" in page.text
     )
+
+
+def test_a_performance_profile_by_hand():
+    from experiments.reporting import numbers
+
+    # In Catch 0 is a miss, -1, and 1 a catch, 1: these end at 0.5 and 1, and at 0.
+    ends = {"rl": [[-1.0, 0.0], [-1.0, 1.0]], "joint": [[-1.0, -1.0]]}
+    steps = np.array([0, 100])
+    comparison = numbers.Comparison(steps, {arm: np.array(x) for arm, x in ends.items()}, None)
+    games, thresholds, found = numbers.profiles({"Catch": comparison, "Pong": None}, ["rl", "joint", "other"])
+    assert games == ["Catch"] and thresholds[0] < 0 and thresholds[-1] == 1.0
+    rl, joint = found["rl"], found["joint"]
+    np.testing.assert_array_equal(rl.point, np.where(thresholds < 0.5, 1.0, 0.5 * (thresholds < 1.0)))
+    np.testing.assert_array_equal(joint.point, thresholds < 0)
+    assert np.isnan(joint.low).all() and list(found) == ["rl", "joint"]
+    # Two runs are drawn again as either one twice, or as both.
+    between = (thresholds > 0.5) & (thresholds < 1)
+    assert (rl.low[between] == 0).all() and (rl.high[between] == 1).all()
 
 
 def test_cost_and_settings(page):

@@ -9,7 +9,7 @@ import numpy as np
 
 from experiments import collect, diagnostic_plots
 from experiments.collect import RunData
-from experiments.reporting import diagnostics, pictures
+from experiments.reporting import diagnostics, numbers, pictures
 from experiments.reporting.contents import Content, Report, run_name
 from experiments.reporting.markup import Markup, breakable, details, figure, listed, plural, tag
 from srl_jax import statistics
@@ -80,6 +80,33 @@ def learning_curves(report: Report) -> Content:
     return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
 
 
+def profiles(report: Report) -> Content:
+    """Performance profiles; the baseline and a few arms in each picture, where there are many."""
+    games, thresholds, found = numbers.profiles(report.comparisons, report.arms)
+    if all(np.isnan(interval.low).all() for interval in found.values()):  # a single seed has no distribution
+        return None
+    curves = {arm: pictures.Curve(thresholds, *interval) for arm, interval in found.items()}
+    seeds = {arm: sum(len(report.comparisons[game].returns[arm]) for game in games) for arm in found}
+    drawn = []
+    for group in groups(list(found), report.baseline):
+        picture = pictures.curves(
+            listed(games),
+            {report.arms.index(arm): curves[arm] for arm in group},
+            size=(5.4, 3.5),
+            label="share of runs above it",
+            across="human-normalised return at the end",
+            limits=(-0.03, 1.03),
+        )
+        caption = _legend(report, {arm: seeds[arm] for arm in group}, "run")
+        drawn.append(figure(picture.source, caption, "Performance profiles", picture.size))
+    note = (
+        "The share of an arm's runs that end above a score, averaged over games, and its 95 % interval. A "
+        "curve that is higher everywhere is better; where it falls steeply, runs end alike. 0 is a random "
+        "policy, 1 a human; in Catch, a miss and a catch."
+    )
+    return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
+
+
 def _limits_of(curves: Iterable[pictures.Curve], levels: Sequence[tuple[str, float]]) -> tuple[float, float]:
     """Of the vertical axis of all pictures of a game, so that they can be compared."""
     values = np.concatenate([*(np.concatenate(curve[1:]) for curve in curves), [y for _, y in levels]])
@@ -100,14 +127,14 @@ def groups(arms: Sequence[str], baseline: str | None) -> list[list[str]]:
     return [first + others[i : i + size] for i in range(0, len(others), size)]
 
 
-def _legend(report: Report, seeds: dict[str, int]) -> Markup:
-    """Which line is whose; arm -> how many seeds it has."""
+def _legend(report: Report, counts: dict[str, int], of: str = "seed") -> Markup:
+    """Which line is whose; arm -> how many seeds, or what `of` says, it has."""
     words = {"-": "solid", "--": "dashed", ":": "dotted"}
     items = []
-    for arm, number in seeds.items():
+    for arm, number in counts.items():
         colour, line = pictures.style(report.arms.index(arm))
         mark = tag("span", style=f"border-top-color: {colour}; border-top-style: {words[line]}")
-        items.append(tag("li", mark, f"{arm} ({plural(number, 'seed')})"))
+        items.append(tag("li", mark, f"{arm} ({plural(number, of)})"))
     return tag("ul", items, class_="legend")
 
 

@@ -20,6 +20,8 @@ from srl_jax.specs import LIMITS
 
 NEVER = 1e18
 """Env steps that stand for never, where a median is drawn again."""
+THRESHOLDS = 101
+"""Of a performance profile."""
 
 
 class Comparison(NamedTuple):
@@ -179,6 +181,37 @@ def scores(comparisons: Mapping[str, Comparison | None], of: str, arms: Sequence
                 area = statistics.area_under_curve(comparison.steps, curves)
                 found.setdefault(arm, {})[game] = area if of == "area" else curves[:, -1]
     return found
+
+
+def profiles(
+    comparisons: Mapping[str, Comparison | None], arms: Sequence[str]
+) -> tuple[list[str], np.ndarray, dict[str, statistics.Interval]]:
+    """The share of an arm's runs that end above a human-normalised return, averaged over games.
+
+    Args:
+        comparisons: from `compare`.
+        arms: in their order.
+
+    Returns:
+        The games that every arm with a policy has; thresholds [T], from just below the smallest score to the
+        largest; arm -> its profile [T]. No arm where there is no such game.
+    """
+    given = scores(comparisons, "final", arms)
+    games = [game for game in comparisons if given and all(game in mine for mine in given.values())]
+    if not games:
+        return [], np.zeros(0), {}
+    normal = {
+        arm: {game: statistics.human_normalised(game, mine[game]) for game in games}
+        for arm, mine in given.items()
+    }
+    every = np.concatenate([x for mine in normal.values() for x in mine.values()])
+    room = 0.02 * (np.ptp(every) or 1.0)
+    thresholds = np.linspace(every.min() - room, every.max(), THRESHOLDS)
+
+    def profile(drawn: Mapping[str, np.ndarray]) -> np.ndarray:
+        return statistics.performance_profile(drawn, thresholds)
+
+    return games, thresholds, {arm: statistics.bootstrap(profile, mine) for arm, mine in normal.items()}
 
 
 def targets(

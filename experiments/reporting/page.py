@@ -16,6 +16,7 @@ SECTIONS = (
     ("figures", "Figures", gallery.figures),
     ("statistics", "Statistics", tables.statistics_of),
     ("curves", "Learning curves", gallery.learning_curves),
+    ("profiles", "Performance profiles", gallery.profiles),
     ("play", "The agents playing", gallery.playing),
     ("panels", "Reconstruction and prediction", gallery.panels),
     ("diagnostics", "Diagnostics", gallery.diagnostic_pictures),

@@ -38,9 +38,12 @@ class Picture(NamedTuple):
 
 
 class Curve(NamedTuple):
-    """One line of a small picture: float64 [points] each; low and high are NaN where there is no interval."""
+    """One line of a small picture: float64 [points] each; low and high are NaN where there is no interval.
 
-    steps: np.ndarray
+    `at` is env steps, but where a picture's label says something else.
+    """
+
+    at: np.ndarray
     point: np.ndarray
     low: np.ndarray
     high: np.ndarray
@@ -173,16 +176,18 @@ def curves(
     *,
     size: tuple[float, float] = (3.4, 2.3),
     label: str = "",
+    across: str = plots.STEPS_LABEL,
     levels: Sequence[tuple[str, float]] = (),
     limits: tuple[float, float] | None = None,
 ) -> Picture:
-    """A picture of one number against env steps; which line is whose is said beside it.
+    """A picture of one number against another, mostly env steps; which line is whose is said beside it.
 
     Args:
         title: above it.
         lines: the arm's place, which gives its style -> its curve.
         size: width and height in inches.
         label: of the vertical axis.
+        across: of the horizontal axis; numbers are abbreviated where it is env steps.
         levels: names and heights of dotted lines across.
         limits: of the vertical axis; None for what the lines need.
     """
@@ -194,11 +199,9 @@ def curves(
         for place, curve in lines.items():
             colour, line = style(place)
             if np.isfinite(curve.low).any():
-                axes.fill_between(curve.steps, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
-            width, marker = 1.5 if small else 1.8, "o" if len(curve.steps) == 1 else ""
-            axes.plot(
-                curve.steps, curve.point, line, color=colour, linewidth=width, marker=marker, markersize=3
-            )
+                axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
+            width, marker = 1.5 if small else 1.8, "o" if len(curve.at) == 1 else ""
+            axes.plot(curve.at, curve.point, line, color=colour, linewidth=width, marker=marker, markersize=3)
         for name, height in levels:
             axes.axhline(height, color="#888888", linestyle=":", linewidth=1)
             axes.annotate(
@@ -206,9 +209,9 @@ def curves(
                 textcoords="offset points", fontsize=7, color="#555555", parse_math=False,
             )  # fmt: skip
         axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
-        plots.count_axis(axes)
+        (plots.count_axis if across == plots.STEPS_LABEL else plots.plain)(axes)
         axes.tick_params(labelsize=7 if small else 9)
-        axes.set_xlabel(plots.STEPS_LABEL, fontsize=7.5 if small else 9)
+        axes.set_xlabel(across, fontsize=7.5 if small else 9)
         axes.set_ylabel(label, fontsize=9)
         if limits is not None:
             axes.set_ylim(*limits)
