@@ -388,7 +388,7 @@ def test_in_a_browser(runs, text, tmp_path):
     path = tmp_path / "report.html"
     path.write_text(text)
     desktop, phone = browser.render(path)
-    assert (desktop.width, phone.width) == (1280, 390) and desktop.images[0] == 9
+    assert (desktop.width, phone.width) == (1280, 390) and desktop.images[0] == 10
     assert browser.problems(desktop) == browser.problems(phone) == []
     # What it is to find, it finds.
     wide = '<div style="width: 2000px">x</div><img src="http://127.0.0.1:9/x.png"><script>x()</script>'
