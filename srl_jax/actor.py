@@ -1,7 +1,11 @@
-"""The side of the loop that faces the environments: stacks of frames, policies, schedules, seeds."""
+"""The side of the loop that faces the environments: stacks of frames, policies, schedules, seeds, threads."""
 
+import os
+import sys
+import threading
 import zlib
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
@@ -57,3 +61,17 @@ def random_policy(num_actions: int, rng: np.random.Generator) -> Policy:
         return rng.integers(0, num_actions, len(frames), dtype=np.int32)
 
     return policy
+
+
+def yielding_thread(name: str) -> ThreadPoolExecutor:
+    """One thread, for environments; it and those that are started in it have a low priority."""
+    return ThreadPoolExecutor(1, name, _yield_to_others)
+
+
+def _yield_to_others() -> None:
+    """Lowers the priority of this thread and of those that it will start, where threads have one (Linux).
+
+    On a CPU the environments then take what an update leaves of it, rather than hold up its threads.
+    """
+    if sys.platform == "linux":
+        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)

@@ -1,17 +1,13 @@
 """The host loop: act, step, add, sample, update; evaluate, log, checkpoint.
 
-With `reporting`, `snapshot` and `checkpoint` it moves data between numpy and the device. The environments
-have a thread of their own, which acts and steps while the main thread has the device update. Both work on
-the parameters and the replay of the step before, and meet before the next one; an evaluation has a thread,
-too, and is awaited before the next row is written. So no result depends on timing.
+With `evaluator`, `reporting`, `snapshot` and `checkpoint` it moves data between numpy and the device. The
+environments have a thread of their own, which acts and steps while the main thread has the device update.
+Both work on the parameters and the replay of the step before, and meet before the next one; an evaluation
+has a thread, too, and is awaited before the next row is written. So no result depends on timing.
 """
 
-import os
-import sys
-import threading
-import time
+import functools
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
 from threading import BrokenBarrierError
 from typing import Any, NamedTuple
@@ -20,12 +16,12 @@ import jax
 import numpy as np
 
 from srl_jax import checkpoint, envs, snapshot
-from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for
+from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for, yielding_thread
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics.measure import Diagnostics
 from srl_jax.errors import ConfigError, Diverged
-from srl_jax.evaluate import Evaluation, evaluate
+from srl_jax.evaluator import Evaluator, Moment
 from srl_jax.replay import Replay
 from srl_jax.reporting import Report
 from srl_jax.types import Params, Window
@@ -33,8 +29,6 @@ from srl_jax.update import Hyper, make_latents, named_key
 
 PICTURES = 6
 """Examples in the picture of what an objective learnt."""
-RECORDED = 501
-"""Frames of the last evaluation that are kept: of 500 env steps."""
 
 
 class Result(NamedTuple):
@@ -53,23 +47,6 @@ class Result(NamedTuple):
     interrupted: bool
     pictures: dict[str, tuple]
     recording: np.ndarray | None
-
-
-class Evaluating(NamedTuple):
-    """An evaluation under way.
-
-    Attributes:
-        future: its result to come.
-        params: of the policy.
-        env_steps, updates: when the run had them.
-        diagnosed: what `srl_jax.diagnostics` says of that moment; JSON values.
-    """
-
-    future: Future
-    params: Params
-    env_steps: int
-    updates: int
-    diagnosed: dict[str, Any]
 
 
 def train(
@@ -109,15 +86,6 @@ def _policy(act: Callable, params_or_state: Any, key: jax.Array) -> Policy:
         return np.asarray(act(params_or_state, frames, key, np.int32(step), np.float32(epsilon)))
 
     return policy
-
-
-def yield_to_others() -> None:
-    """Lowers the priority of this thread and of those that it will start, where threads have one (Linux).
-
-    On a CPU the environments then take what an update leaves of it, rather than hold up its threads.
-    """
-    if sys.platform == "linux":
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 15)
 
 
 def act_and_step(policy: Policy, observations: np.ndarray, step: int, epsilon: float, env) -> tuple:
@@ -169,10 +137,8 @@ class Run:
     ):
         self.config, self.out, self.stop = config, out, stop
         self.checkpoint_every = config.checkpoint_every or config.eval_every
-        # One thread for the training environments and one for evaluation. They are made there, so that the
-        # threads that they start yield to the device's, too.
-        self.env_thread = ThreadPoolExecutor(1, "environments", yield_to_others)
-        self.eval_thread = ThreadPoolExecutor(1, "evaluation", yield_to_others)
+        # The environments are made in their thread, so that those that they start yield, too.
+        self.env_thread = yielding_thread("environments")
         self.env = self.env_thread.submit(self.make_env, "train", config.num_envs).result()
         self.num_actions = int(self.env.single_action_space.n)
         self.agent = agent or make_agent(config, self.num_actions)
@@ -200,10 +166,11 @@ class Run:
         self.given = self.given_policy() if config.policy_from else None
         self.act_key = named_key(self.key, "act")
         self.eval_key = named_key(self.key, "eval")
-        self.eval_env = None
-        self.evaluating: Evaluating | None = None
-        self.recording: np.ndarray | None = None  # frames of the last evaluation, uint8 [T, H, W]
-        self.stopped = False  # says to the evaluation that nobody waits for it
+        self.evaluator = Evaluator(
+            config,
+            lambda params: greedy_policy(self.agent, params, self.eval_key),
+            functools.partial(self.make_env, "eval"),
+        )
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
         self.env_steps = self.updates = 0
@@ -226,7 +193,7 @@ class Run:
         """Runs to the end, or until it is told to stop."""
         finished = False
         try:
-            with self.report, self.env_thread, self.eval_thread:
+            with self.report, self.env_thread, self.evaluator:
                 try:
                     finished = self.run()
                 except (KeyboardInterrupt, BrokenBarrierError):  # the latter where another seed was the first
@@ -235,20 +202,18 @@ class Run:
                         last = f"the last checkpoint is of {self.saved.env_steps}"
                     self.report.progress.note(f"interrupted after {self.env_steps} env steps; {last}")
                 finally:
-                    self.stopped = True
+                    self.evaluator.leave()
                 pictures = self.pictures()
         finally:
             self.env.close()
-            if self.eval_env is not None:
-                self.eval_env.close()
-        return Result(self.env_steps, self.updates, not finished, pictures, self.recording)
+        return Result(self.env_steps, self.updates, not finished, pictures, self.evaluator.recording)
 
     def run(self) -> bool:
         """To the last env step, or to the return that ends the run; False where it was told to stop."""
         config = self.config
         if not self.resumed:
             self.start()
-            self.start_evaluation(self.state.params, 0, 0, self.diagnose())
+            self.start_evaluation(self.now())
         while self.env_steps < config.steps and not self.solved:
             if self.agent.agree(self.stop()):
                 self.save()
@@ -266,8 +231,7 @@ class Run:
             if rows[0]:
                 self.write_train_row()
             if rows[1]:
-                diagnosed = self.diagnose()
-                self.start_evaluation(self.state.params, self.env_steps, self.updates, diagnosed)
+                self.start_evaluation(self.now())
             if self.passed(before, self.checkpoint_every) and self.env_steps < config.steps:
                 self.keep_encoder()  # first: a run that goes on from the checkpoint does not write it again
                 self.save()
@@ -405,6 +369,10 @@ class Run:
                 "the checkpoints are from before"
             )
 
+    def now(self) -> Moment:
+        """What an evaluation that is due is of."""
+        return Moment(self.state.params, self.env_steps, self.updates, self.diagnose())
+
     def diagnose(self) -> dict[str, Any]:
         """What `srl_jax.diagnostics` says of the run as it is now; changes nothing of it.
 
@@ -424,66 +392,34 @@ class Run:
             self.save_parameters("encoders", diagnostics.parts(state.params), keep=0)
         return values
 
-    def start_evaluation(
-        self, params: Params, env_steps: int, updates: int, diagnosed: dict[str, Any]
-    ) -> None:
-        """Has the policy of these parameters evaluated, in a thread, while training goes on.
+    def start_evaluation(self, moment: Moment) -> None:
+        """Has the policy of that moment evaluated while training goes on.
 
         In a mode without RL nothing is played, and a row of the diagnostics is written.
-
-        Args:
-            params: which nothing changes.
-            env_steps, updates: when the run had them.
-            diagnosed: from `diagnose`, of that moment.
         """
-        config = self.config
-        if not self.agent.mode.rl:
-            if diagnosed:
-                self.report.eval_row(env_steps, updates, diagnosed)
-            return
-        policy = greedy_policy(self.agent, params, self.eval_key)
-        seed = seed_for(config.seed, "eval", env_steps)
-
-        def play() -> tuple[Evaluation | None, float]:
-            began = time.perf_counter()
-            if self.eval_env is None:
-                self.eval_env = self.make_env("eval", min(config.num_envs, config.eval_games))
-            played = evaluate(
-                policy,
-                self.eval_env,
-                games=config.eval_games,
-                seed=seed,
-                epsilon=config.eps_eval,
-                stack=config.frame_stack,
-                max_steps=config.eval_max_steps,
-                record=RECORDED,
-                stop=lambda: self.stopped,
-            )
-            return played, time.perf_counter() - began
-
-        future = self.eval_thread.submit(play)
-        self.evaluating = Evaluating(future, params, env_steps, updates, diagnosed)
+        if self.agent.mode.rl:
+            self.evaluator.start(moment)
+        elif moment.diagnosed:
+            self.report.eval_row(moment.env_steps, moment.updates, moment.diagnosed)
 
     def finish_evaluation(self) -> None:
         """Waits for the evaluation that is under way, writes its row; sets `solved`.
 
         Called before the next row is written, so that rows are in the same order however long games take.
         """
-        if self.evaluating is None:
+        if (finished := self.evaluator.finish()) is None:
             return
-        (future, _, env_steps, updates, diagnosed), self.evaluating = self.evaluating, None
-        played, seconds = future.result()
-        self.recording = played.frames
+        moment, played, seconds = finished
         mean = float(np.mean(played.returns))
         values = {
             "eval/return_mean": mean,
             "eval/returns": played.returns,
             "eval/lengths": played.lengths,
             "wall_eval_s": round(seconds, 3),
-        } | diagnosed
-        self.report.eval_row(env_steps, updates, values)
+        }
+        self.report.eval_row(moment.env_steps, moment.updates, values | moment.diagnosed)
         self.report.progress.note(
-            f"evaluation after {env_steps} env steps: mean return {mean:.2f} "
+            f"evaluation after {moment.env_steps} env steps: mean return {mean:.2f} "
             f"over {len(played.returns)} games, {seconds:.1f} s"
         )
         self.report.progress.update(self.env_steps, evaluation=mean)

@@ -1,8 +1,8 @@
 """Everything that a run is at one moment, between two steps, and a run that goes on from there.
 
-What changes while a run runs lives in `srl_jax.loop.Run`. Here it is listed once for writing and once for
-reading; an attribute that somebody adds to a run and forgets here makes resumed runs differ, which
-`experiments.soak` finds.
+What changes while a run runs lives in `srl_jax.loop.Run` and what it holds. Here it is listed once for
+writing and once for reading; an attribute that somebody adds to a run and forgets here makes resumed runs
+differ, which `experiments.soak` finds.
 """
 
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from srl_jax import checkpoint
 from srl_jax.checkpoint import Manifest, State
 from srl_jax.diagnostics.measure import check_diagnosed
 from srl_jax.errors import ConfigError
+from srl_jax.evaluator import Moment
 from srl_jax.optim import real_copy
 
 if TYPE_CHECKING:
@@ -29,20 +30,16 @@ def take(run: "Run") -> State:
     learner = {"slow": state.slow, "opt_state": state.opt_state, "step": state.step}
     trees = {"learner": learner | {"key": jax.random.key_data(state.key)}}
     arrays = {"stacks": run.stacks.frames}
-    if run.recording is not None:
-        arrays["recording"] = run.recording
+    if run.evaluator.recording is not None:
+        arrays["recording"] = run.evaluator.recording
     replay_arrays, replay_numbers = run.replay.snapshot()
     arrays |= {f"replay_{name}": x for name, x in replay_arrays.items()}
     arrays |= {f"env_{name}": x for name, x in run.env.snapshot().items()}
     evaluating = None
-    if run.evaluating is not None:
-        evaluating = {
-            "env_steps": run.evaluating.env_steps,
-            "updates": run.evaluating.updates,
-            "diagnosed": run.evaluating.diagnosed,
-        }
-        if evaluating["updates"] != run.updates:  # else its parameters are those of now
-            trees["evaluation"] = run.evaluating.params
+    if (moment := run.evaluator.moment) is not None:
+        evaluating = {key: getattr(moment, key) for key in ("env_steps", "updates", "diagnosed")}
+        if moment.updates != run.updates:  # else its parameters are those of now
+            trees["evaluation"] = moment.params
     unchanged = set()
     changed = None if run.saved is None else run.replay.changed_slots(run.saved_position)
     for name, slots in chunks(run.replay):
@@ -119,11 +116,12 @@ def _put(run: "Run", manifest: Manifest, numbers: dict[str, Any]) -> None:
         replay.frames[:, slots] = array(name, np.empty_like(replay.frames[:, slots], order="C"))
     replay.restore(replay_arrays, numbers["replay"])
     array("stacks", run.stacks.frames)
-    run.recording = array("recording") if "recording.npy" in manifest.files else None
-    if run.recording is not None:
-        length, *shape = run.recording.shape
-        if run.recording.dtype != np.uint8 or tuple(shape) != replay.frame_shape or not length:
+    recording = array("recording") if "recording.npy" in manifest.files else None
+    if recording is not None:
+        length, *shape = recording.shape
+        if recording.dtype != np.uint8 or tuple(shape) != replay.frame_shape or not length:
             raise ValueError("the recording is not made of frames")
+    run.evaluator.recording = recording
     run.env_thread.submit(run.env.restore, group("env_")).result()
     run.random.bit_generator.state = numbers["random"]
     run.env_steps, run.updates = manifest.env_steps, manifest.updates
@@ -141,7 +139,7 @@ def _put(run: "Run", manifest: Manifest, numbers: dict[str, Any]) -> None:
             policy = checkpoint.load_into(shapes.params, checkpoint.load_tree(manifest, "evaluation"), where)
         # Runs from before there were diagnostics have none.
         diagnosed = check_diagnosed(evaluating.get("diagnosed", {}))
-        run.start_evaluation(real_copy(policy), env_steps, updates, diagnosed)
+        run.start_evaluation(Moment(real_copy(policy), env_steps, updates, diagnosed))
 
 
 def chunks(replay: Any) -> list[tuple[str, slice]]:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from flax import serialization
 
-from srl_jax import checkpoint, envs, loop, snapshot
+from srl_jax import checkpoint, envs, evaluator, loop, snapshot
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
@@ -59,7 +59,8 @@ def digests(run):
     arrays, numbers = run.replay.snapshot()
     found |= {f"replay {name}": x for name, x in arrays.items()} | {"frames": run.replay.frames}
     found |= {f"env {name}": x for name, x in run.env.snapshot().items()} | {"stacks": run.stacks.frames}
-    found |= {} if run.recording is None else {"recording": run.recording}
+    recording = run.evaluator.recording
+    found |= {} if recording is None else {"recording": recording}
     found = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest() for name, x in found.items()}
     return found | {
         "replay": json.dumps(numbers),
@@ -168,13 +169,13 @@ def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(whole, tmp_path, 
 @pytest.mark.parametrize("stop", [120, 124])
 def test_a_return_that_ends_a_run_ends_it_all_the_same(tmp_path, monkeypatch, stop):
     # The evaluation of 120 reaches it, which is known when the next row is due, at 160.
-    evaluate = loop.evaluate
+    evaluate = evaluator.evaluate
 
     def better(policy, env, *, seed, **options):
         played = evaluate(policy, env, seed=seed, **options)
         return played and played._replace(returns=[float(seed == loop.seed_for(0, "eval", 120))] * 5)
 
-    monkeypatch.setattr(loop, "evaluate", better)
+    monkeypatch.setattr(evaluator, "evaluate", better)
     config = make_config("rl_only", stop_at_return=0.5)
     result, whole_end = go(config, tmp_path / "whole")
     assert result.env_steps == 160 and whole_end["solved"] and not result.interrupted
@@ -202,23 +203,22 @@ def test_chunks_of_frames_that_nothing_was_written_to_are_links(tmp_path, monkey
         other.step()
     np.testing.assert_array_equal(run.replay.frames, other.replay.frames)
     for one in (run, other):
-        one.stopped = True
-        one.env_thread.shutdown()
-        one.eval_thread.shutdown()
+        with one.env_thread, one.evaluator:
+            pass
 
 
 # Every attribute of a run, sorted
 
 
 IN_THE_SNAPSHOT = {
-    "state", "replay", "random", "evaluating", "stacks", "score", "env_steps", "updates", "solved", "report",
-    "env", "saved", "saved_position", "recording",
+    "state", "replay", "random", "evaluator", "stacks", "score", "env_steps", "updates", "solved", "report",
+    "env", "saved", "saved_position",
 }  # fmt: skip
 OF_THE_CONFIGURATION = {
     "config", "out", "stop", "checkpoint_every", "num_actions", "agent", "learning_rates", "key", "given",
     "act_key", "eval_key",
 }  # fmt: skip
-OF_THE_PROCESS = {"env_thread", "eval_thread", "eval_env", "stopped", "resumed"}
+OF_THE_PROCESS = {"env_thread", "resumed"}
 IN_ENCODERS = {"diagnostics"}
 
 
@@ -227,6 +227,8 @@ def test_every_attribute_of_a_run_is_taken_or_follows_from_the_configuration(tmp
     run = make_run(make_config("rl_only"), tmp_path / "run")
     run.env_thread.shutdown()
     assert set(vars(run)) == IN_THE_SNAPSHOT | OF_THE_CONFIGURATION | OF_THE_PROCESS | IN_ENCODERS
+    of_the_process = {"_config", "_policy", "_make_env", "_thread", "_env", "_future", "_left"}
+    assert set(vars(run.evaluator)) == {"moment", "recording"} | of_the_process
 
 
 # Snapshots that somebody has made up: the sums fit
@@ -247,7 +249,7 @@ def put(stopped, tmp_path, monkeypatch):
     config, path = stopped
     copy = shutil.copytree(path, tmp_path / "copy")
     run = make_run(config, copy)
-    run.stopped = True  # nobody waits for its evaluations
+    run.evaluator.leave()  # nobody waits for its evaluations
     shapes = run.agent.shapes()
     run.agent = run.agent._replace(shapes=lambda: shapes, adopt=lambda state: state)  # for speed, as the next
     monkeypatch.setattr("os.fsync", lambda _: None)
@@ -263,9 +265,8 @@ def put(stopped, tmp_path, monkeypatch):
 
     put.folder = copy / "checkpoints" / "000000072"
     put.run = run
-    yield put
-    run.env_thread.shutdown()
-    run.eval_thread.shutdown()
+    with run.env_thread, run.evaluator:
+        yield put
 
 
 def replace(folder, file, data, **entry):

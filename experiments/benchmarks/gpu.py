@@ -90,16 +90,15 @@ def whole_run(seconds: float) -> dict[str, float]:
             while time.perf_counter() - start < seconds:
                 run.step()
             rate = (run.env_steps - first) / (time.perf_counter() - start)
-            with run.report:
+            with run.report, run.evaluator:
                 seconds = []
                 for _ in range(2):  # the first compiles
                     start = time.perf_counter()
-                    run.start_evaluation(run.state.params, run.env_steps, run.updates, run.diagnose())
+                    run.start_evaluation(run.now())
                     run.finish_evaluation()
                     seconds.append(time.perf_counter() - start)
         finally:
             run.env_thread.shutdown()
-            run.eval_thread.shutdown()
             run.env.close()
     evaluation = seconds[1]
     evaluations = config.steps // config.eval_every + 1

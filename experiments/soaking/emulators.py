@@ -366,7 +366,7 @@ def through_the_loop(short: bool, folder: Path, say: Say) -> list[Count]:
                 seed=index,
             )
             run = Recorded(config, folder, steps, options)
-            with run.env_thread, run.eval_thread:
+            with run.env_thread, run.evaluator:
                 done = index * total
                 drive(run, steps, counts, lambda env_steps: progress.update(done + env_steps, game=game))  # noqa: B023
                 run.env.close()
