@@ -169,7 +169,7 @@ def test_numbers_by_hand(page):
     # One of rl's two runs is at 0.75 after 150 env steps, the other one never.
     assert table["rl"][5] == "> 200 [150, > 200], 1 of 2 did"
     assert table["joint"][1:3] == ["1.00 [1.00, 1.00]", "+0.25 [0.00, 0.50]"]
-    assert table["joint"][3:5] == ["0.75 [0.75, 0.75]", "+0.44 ▲ [0.25, 0.62]"]
+    assert table["joint"][3:5] == ["0.75 [0.75, 0.75]", "+0.44 [0.25, 0.62]"]
     assert table["joint"][5] == "75 [75, 75], 2 of 2 did"
     assert table[ODD][:3] == ["1", "−1.00 (no interval)", "−1.75 (no interval)"]
     assert "Compared up to 200 env steps, where rl, seed 0, ended." in page.text
@@ -179,14 +179,29 @@ def test_numbers_by_hand(page):
     assert over["joint"][4:] == ["0.00 [0.00, 0.00]", "0.75 [0.50, 1.00]"]
 
 
-def test_the_sentences_say_what_the_intervals_say(page):
-    assert (
-        "rl has 0.31 [0.12, 0.50]. Above it, by an interval that excludes 0: joint (0.44 [0.25, 0.62])."
-        in page.text
-    )
+def test_two_seeds_tell_nothing(page):
+    assert "rl has 0.31 [0.12, 0.50]. Too few seeds to say whether they differ from it: joint;" in page.text
+    assert "Above it" not in page.text
     assert (
         "1 arm without an interval" in page.text and "contains the truth in about 67 % of cases" in page.text
     )
+
+
+def test_the_sentences_say_what_the_intervals_say(tmp_path):
+    # Areas: rl 0, 0.25, 0.5; above 1, three times; near 0, 0.25, 0.75.
+    ends = {"rl": [0.0, 0.5, 1.0], "near": [0.0, 0.5, 1.5], "above": [2.0, 2.0, 2.0]}
+    for arm, values in ends.items():
+        mode = "rl_only" if arm == "rl" else "joint"
+        for seed, value in enumerate(values):
+            write_run(tmp_path / arm / f"seed{seed}", [0.0, value / 2, value], seed=seed, mode=mode)
+    page = Page(build(tmp_path, media=False))
+    assert (
+        "rl has 0.25 [0.00, 0.50]. Above it, by an interval that excludes 0: above (0.75 [0.50, 1.00])."
+        in (page.text)
+    )
+    assert "Not told apart from it: near." in page.text and "Too few" not in page.text
+    table = page.table("Statistics of Catch")
+    assert "▲" in table["above"][4] and "▲" not in table["near"][4]
 
 
 def test_a_performance_profile_by_hand():

@@ -13,6 +13,8 @@ from srl_jax.statistics import Interval
 
 Content = Markup | list | None
 """Of a section; None for none."""
+TELLING = 3
+"""Seeds of both arms from which a difference is said to have a side: the interval of two is their range."""
 
 
 class Report(NamedTuple):
@@ -51,6 +53,17 @@ class Report(NamedTuple):
         """The runs of a game, or of one arm on it."""
         return [run for run in self.runs if run.game == game and arm in (None, run.arm)]
 
+    def seeds_behind(self, arm: str, game: str | None = None) -> int:
+        """Of a difference from the baseline: the fewest that it or the arm has, on the game or on any."""
+        games = [game] if game is not None else self.comparisons
+        counts = [
+            len(comparison.returns.get(name, ()))
+            for name in (arm, self.baseline)
+            for comparison in (self.comparisons[game] for game in games)
+            if comparison is not None
+        ]
+        return min(counts, default=0)
+
 
 def run_name(run: RunData) -> str:
     """A run as a reader finds it."""
@@ -64,6 +77,8 @@ def limits(interval: Interval) -> str:
     return f"[{number(float(interval.low))}, {number(float(interval.high))}]"
 
 
-def side(interval: Interval) -> int:
-    """1 or -1 where the interval is above or below 0, else 0."""
+def side(interval: Interval, seeds: int) -> int:
+    """1 or -1 where the interval of a difference is above or below 0, else 0, as for fewer than `TELLING`."""
+    if seeds < TELLING:
+        return 0
     return int(interval.low > 0) - int(interval.high < 0)

@@ -7,7 +7,7 @@ import numpy as np
 from experiments import collect
 from experiments.reporting import configs, numbers, pictures
 from experiments.reporting.configs import About
-from experiments.reporting.contents import Content, Report, limits, run_name, side
+from experiments.reporting.contents import TELLING, Content, Report, limits, run_name, side
 from experiments.reporting.markup import Markup, details, figure, listed, number, plural, table, tag
 from experiments.reporting.numbers import Row
 from experiments.reporting.tables import interval_of, summary_of
@@ -107,7 +107,7 @@ def what_it_says(report: Report) -> Content:
         items = []
         for what, of in (("Return at the end", "final"), ("Return averaged over env steps", "area")):
             found = {arm: getattr(row, f"{of}_difference") for arm, row in rows.items()}
-            items.append(_sentence(report, what, getattr(base, of), found))
+            items.append(_sentence(report, what, getattr(base, of), found, game))
         parts.append(tag("ul", items))
         pictured += _picture(report, game, rows)
     parts += _over_games(report)
@@ -164,23 +164,46 @@ def _over_games(report: Report) -> list:
     return [title, tag("ul", items)] if items else []
 
 
-def _sentence(report: Report, what: str, base: Interval, differences: dict[str, Interval | None]) -> Markup:
-    """What the baseline has, and the arms whose difference from it has an interval without 0."""
+def _sentence(
+    report: Report,
+    what: str,
+    base: Interval,
+    differences: dict[str, Interval | None],
+    game: str | None = None,
+) -> Markup:
+    """What the baseline has, and the arms whose difference from it has an interval without 0.
+
+    Args:
+        report: with the baseline.
+        what: that is compared.
+        base: what the baseline has.
+        differences: arm -> its difference from it.
+        game: that they are of; None for all together.
+    """
     known = {arm: x for arm, x in differences.items() if x is not None and not np.isnan(x.low)}
-    clear = {arm: x for arm, x in known.items() if side(x)}
+    seeds = {arm: report.seeds_behind(arm, game) for arm in known}
+    few = [arm for arm in known if seeds[arm] < TELLING]
+    sides = {arm: side(x, seeds[arm]) for arm, x in known.items()}
+    clear = {arm: x for arm, x in known.items() if sides[arm]}
     text = f"{what}: {report.baseline} has {number(float(base.point))} {limits(base)}. "
     for word, sign in (("Above", 1), ("Below", -1)):
-        items = [arm for arm, x in clear.items() if side(x) == sign]
+        items = [arm for arm, x in clear.items() if sides[arm] == sign]
         if FEW_ARMS < len(items) == len(differences):
             items = ["all other arms"]
         elif len(items) <= FEW_ARMS:
             items = [f"{arm} ({number(float(clear[arm].point))} {limits(clear[arm])})" for arm in items]
         if items:
             text += f"{word} it, by an interval that excludes 0: {listed(items)}. "
-    if clear and len(clear) < len(known):
-        text += f"Not told apart from it: {listed(arm for arm in known if arm not in clear)}. "
-    elif known and not clear:
-        text += "No arm differs from it by an interval that excludes 0. "
+    if others := [arm for arm in known if arm not in clear and arm not in few]:
+        if clear:
+            text += f"Not told apart from it: {listed(others)}. "
+        else:
+            text += "No arm differs from it by an interval that excludes 0. "
+    if few:
+        text += (
+            f"Too few seeds to say whether they differ from it: {listed(few)}; with fewer than {TELLING}, "
+            "an interval is the range of the seeds."
+        )
     if unknown := len(differences) - len(known):
         text += (
             f"{plural(unknown, 'arm')} without an interval: one seed cannot tell a difference from chance."

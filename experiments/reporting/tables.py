@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from experiments.reporting import numbers
-from experiments.reporting.contents import Content, Report, limits, side
+from experiments.reporting.contents import TELLING, Content, Report, limits, side
 from experiments.reporting.markup import Markup, details, number, plural, table, tag
 from experiments.reporting.numbers import Comparison, Row
 from srl_jax import statistics
@@ -36,7 +36,7 @@ def statistics_of(report: Report) -> Content:
             "Runs of a game are compared at env steps that all of them have. In brackets: 95 % "
             "stratified-bootstrap intervals over seeds; a single seed has none. Differences are from ",
             tag("strong", report.baseline),
-            "; ▲ and ▼ mark those whose interval excludes 0.",
+            f"; ▲ and ▼ mark those whose interval excludes 0, where both have {TELLING} seeds or more.",
         )
     ]
     for game, comparison in report.comparisons.items():
@@ -59,8 +59,9 @@ def _of_game(report: Report, game: str, comparison: Comparison) -> list:
     body = []
     for row in report.rows:
         if row.game == game:
-            cells = [row.arm, row.seeds, _cell(row.final), _difference(row.final_difference)]
-            cells += [_cell(row.area), _difference(row.area_difference)]
+            seeds = report.seeds_behind(row.arm, game)
+            cells = [row.arm, row.seeds, _cell(row.final), _difference(row.final_difference, seeds)]
+            cells += [_cell(row.area), _difference(row.area_difference, seeds)]
             body.append(cells + ([_reaching(row, end)] if score is not None else []))
     notes = []
     if (cut := comparison.cut_by) is not None:
@@ -90,11 +91,11 @@ def _cell(interval: Interval) -> list:
     return [number(float(interval.point)), " ", tag("span", limits(interval), class_="ci")]
 
 
-def _difference(interval: Interval | None) -> Content:
+def _difference(interval: Interval | None, seeds: int) -> Content:
     if interval is None:
         return Markup("–")
     shown = ("+" if float(interval.point) > 0 else "") + number(float(interval.point))
-    if (direction := side(interval)) > 0:
+    if (direction := side(interval, seeds)) > 0:
         shown = tag("span", f"{shown} ▲", class_="up")
     elif direction < 0:
         shown = tag("span", f"{shown} ▼", class_="down")
