@@ -242,8 +242,8 @@ def dry_run(
     seconds, unknown = speed.seconds_left(entries, reached, per_s, workers, done)
     line = f"{total[1]} of {total[0]} runs to run, {total[2]:,} env steps"
     if total[1]:
-        line += f", {hms(seconds)} with {workers} at once"
-        if unknown:
+        line += f", {hms(seconds) if seconds else 'unknown time'} with {workers} at once"
+        if unknown and seconds:
             line += f" and {unknown} runs of unknown speed"
         line += f"; speeds: {'; '.join(sorted(sources))}"
     return [*lines, line]
