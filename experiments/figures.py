@@ -91,49 +91,55 @@ def evaluated(
         "forced": forced,
         "games": {},
     }
-    areas: dict[str, dict[str, np.ndarray]] = {}
     for game in games:
-        members = groups.get(game, {})
-        members = {name: members[name] for name in names if name in members}
+        members = {name: groups[game][name] for name in names if name in groups.get(game, {})}
         if not members:
             continue
         found = {name: [steps_and_returns(run) for run in arm] for name, arm in members.items()}
         until = min(int(steps[-1]) for arm in found.values() for steps, _ in arm)
+        ends = {name: _ends(arm, until) for name, arm in found.items()}
         entry: dict[str, Any] = {"equal_until": until, "arms": {}}
-        at_end: dict[str, np.ndarray] = {}
         for name, arm in found.items():
-            grid, returns = statistics.at_equal_steps(arm)
-            interval = statistics.curve_interval(returns, **BOOTSTRAP)
-            area = statistics.area_under_curve(grid, returns, until)
-            areas.setdefault(game, {})[name] = area
-            at_end[name] = np.array([np.interp(until, grid, one) for one in returns])
-            entry["arms"][name] = {
-                "seeds": [run.seed for run in members[name]],
-                "env_steps": grid.tolist(),
-                **_limits(interval),
-                "runs": _plain(returns),
-                "area_under_curve": _limits(statistics.bootstrap(statistics.mean, {game: area}, **BOOTSTRAP)),
-                "at_the_end": _limits(
-                    statistics.bootstrap(statistics.mean, {game: at_end[name]}, **BOOTSTRAP)
-                ),
+            values = {"seeds": [run.seed for run in members[name]]} | _curve(arm)
+            values |= {
+                of: _limits(statistics.bootstrap(statistics.mean, {game: x}, **BOOTSTRAP))
+                for of, x in ends[name].items()
             }
-        for name in list(entry["arms"])[1:] if names[0] in entry["arms"] else []:
-            ours, base = {game: areas[game][name]}, {game: areas[game][names[0]]}
-            entry["arms"][name]["against_baseline"] = {
-                "area_under_curve": _limits(statistics.bootstrap_difference(ours, base, **BOOTSTRAP)),
-                "at_the_end": _limits(
-                    statistics.bootstrap_difference(
-                        {game: at_end[name]}, {game: at_end[names[0]]}, **BOOTSTRAP
-                    )
-                ),
-                "probability_of_improvement": _limits(
-                    statistics.bootstrap(statistics.probability_of_improvement, ours, base, **BOOTSTRAP)
-                ),
-            }
+            if name != names[0] and names[0] in found:
+                values["against_baseline"] = _against(game, ends[name], ends[names[0]])
+            entry["arms"][name] = values
         config = next(iter(members.values()))[0].config
         entry["published"] = [level._asdict() for level in published_levels(game, methods, config, until)]
         result["games"][game] = entry
     return result
+
+
+def _curve(arm: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
+    """The learning curve of an arm on a game: at its own steps, that all of its runs have."""
+    grid, returns = statistics.at_equal_steps(arm)
+    interval = statistics.curve_interval(returns, **BOOTSTRAP)
+    return {"env_steps": grid.tolist(), **_limits(interval), "runs": _plain(returns)}
+
+
+def _ends(arm: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str, np.ndarray]:
+    """What arms are compared by, float64 [runs] each: up to an env step that all of them have."""
+    grid, returns = statistics.at_equal_steps(arm)
+    return {
+        "area_under_curve": statistics.area_under_curve(grid, returns, until),
+        "at_the_end": np.array([np.interp(until, grid, one) for one in returns]),
+    }
+
+
+def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """An arm's `_ends` against the baseline's."""
+    found = {
+        of: statistics.bootstrap_difference({game: ours[of]}, {game: base[of]}, **BOOTSTRAP) for of in ours
+    }
+    areas = ({game: x["area_under_curve"]} for x in (ours, base))
+    found["probability_of_improvement"] = statistics.bootstrap(
+        statistics.probability_of_improvement, *areas, **BOOTSTRAP
+    )
+    return {name: _limits(interval) for name, interval in found.items()}
 
 
 def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[curves.Level]:
