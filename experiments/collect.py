@@ -95,6 +95,17 @@ def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
     return steps, np.array([row["eval/return_mean"] for row in rows], np.float64)
 
 
+def comparable(runs: Sequence[RunData]) -> list[RunData]:
+    """Runs whose learning curves can be laid beside each other, in their order.
+
+    One without evaluations is left out, and one with a single evaluation where others of its game have more:
+    it has only just begun, and would cut the curves of all others down to that env step.
+    """
+    points = [len(steps_and_returns(run)[0]) for run in runs]
+    under_way = {run.game for run, count in zip(runs, points, strict=True) if count > 1}
+    return [run for run, count in zip(runs, points, strict=True) if count > (run.game in under_way)]
+
+
 def check_arms(runs: Sequence[RunData]) -> None:
     """Whether runs of one arm and game differ in nothing but their seed and where its encoder comes from.
 

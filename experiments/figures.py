@@ -20,7 +20,7 @@ from absl import flags
 from experiments import collect, curves, plots, sweep
 from experiments import flags as config_flags
 from experiments.arms import FIGURES, Figure, figures_named
-from experiments.collect import RunData, steps_and_returns
+from experiments.collect import RunData, comparable, steps_and_returns
 from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
 from srl_jax import statistics
 from srl_jax.config import Config
@@ -30,8 +30,6 @@ from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
 
 FLAGS = flags.FLAGS
-
-BOOTSTRAP = {"repetitions": 10_000, "seed": 0}
 
 
 def planned(
@@ -68,7 +66,7 @@ def evaluated(
 
     Args:
         figure: its first arm is the baseline.
-        runs: on disk; those of other arms and games are left out.
+        runs: on disk; those of other arms and games are left out, and those that are not `comparable`.
         games: in this order.
         methods: whose published scores are given, with what differs.
         force: compare runs of different protocols, and say what differs.
@@ -77,7 +75,7 @@ def evaluated(
         ConfigError: runs cannot be compared.
     """
     names = [arm.name for arm in figure.arms]
-    runs = [run for run in runs if run.arm in names and run.game in games and len(steps_and_returns(run)[0])]
+    runs = comparable([run for run in runs if run.arm in names and run.game in games])
     collect.check_arms(runs)
     forced = collect.check_protocols(runs, force=force)
     groups = collect.grouped(runs)
@@ -102,8 +100,7 @@ def evaluated(
         for name, arm in found.items():
             values = {"seeds": [run.seed for run in members[name]]} | _curve(arm)
             values |= {
-                of: _limits(statistics.bootstrap(statistics.mean, {game: x}, **BOOTSTRAP))
-                for of, x in ends[name].items()
+                of: _limits(statistics.bootstrap(statistics.mean, {game: x})) for of, x in ends[name].items()
             }
             if name != names[0] and names[0] in found:
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
@@ -117,7 +114,7 @@ def evaluated(
 def _curve(arm: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
     """The learning curve of an arm on a game: at its own steps, that all of its runs have."""
     grid, returns = statistics.at_equal_steps(arm)
-    interval = statistics.curve_interval(returns, **BOOTSTRAP)
+    interval = statistics.curve_interval(returns)
     return {"env_steps": grid.tolist(), **_limits(interval), "runs": _plain(returns)}
 
 
@@ -132,13 +129,9 @@ def _ends(arm: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str,
 
 def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """An arm's `_ends` against the baseline's."""
-    found = {
-        of: statistics.bootstrap_difference({game: ours[of]}, {game: base[of]}, **BOOTSTRAP) for of in ours
-    }
+    found = {of: statistics.bootstrap_difference({game: ours[of]}, {game: base[of]}) for of in ours}
     areas = ({game: x["area_under_curve"]} for x in (ours, base))
-    found["probability_of_improvement"] = statistics.bootstrap(
-        statistics.probability_of_improvement, *areas, **BOOTSTRAP
-    )
+    found["probability_of_improvement"] = statistics.bootstrap(statistics.probability_of_improvement, *areas)
     return {name: _limits(interval) for name, interval in found.items()}
 
 

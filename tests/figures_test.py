@@ -9,6 +9,7 @@ from absl import flags
 from experiments import collect, figures
 from experiments import flags as config_flags
 from experiments.arms import FIGURES, Figure, FigureArm
+from experiments.reporting.numbers import compare, rows
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from tests.helpers import write_run
@@ -64,6 +65,29 @@ def test_a_longer_arm_is_compared_where_the_others_are(tmp_path):
     assert (a["area_under_curve"]["mean"], b["area_under_curve"]["mean"]) == (1.0, 0.5)
     # One seed has no interval.
     assert a["low"] == [None, None] and b["against_baseline"]["at_the_end"]["low"] is None
+
+
+def test_a_run_that_has_only_begun_cuts_no_curve(runs):
+    before = _evaluated(runs)["games"]
+    write_run(runs / "Catch/a/seed2", (7,), seed=2)
+    assert _evaluated(runs)["games"] == before
+    # On a game of which there is nothing more, it is what there is.
+    (runs / "alone").mkdir()
+    write_run(runs / "alone/Catch/a/seed2", (7,), seed=2)
+    alone = _evaluated(runs / "alone")["games"]["Catch"]
+    assert alone["equal_until"] == 0 and alone["arms"]["a"]["mean"] == [7.0]
+
+
+def test_the_report_has_the_same_numbers(runs):
+    entry = _evaluated(runs)["games"]["Catch"]["arms"]
+    found = [run for run in collect.load_runs(runs) if run.arm in ("a", "b")]
+    for row in rows(compare(found, ["a", "b"]), ["a", "b"], "a", {}):
+        mine = entry[row.arm]
+        assert tuple(mine["at_the_end"].values()) == row.final
+        assert tuple(mine["area_under_curve"].values()) == row.area
+    against = entry["b"]["against_baseline"]
+    assert tuple(against["at_the_end"].values()) == row.final_difference
+    assert tuple(against["area_under_curve"].values()) == row.area_difference
 
 
 def test_other_games_and_arms_without_runs_are_left_out(runs):

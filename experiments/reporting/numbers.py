@@ -134,19 +134,14 @@ def _last(steps: int, every: int) -> int:
 
 
 def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Comparison | None]:
-    """Game -> its learning curves at equal steps; None where there is no step that all runs have.
-
-    A run that was evaluated once is left out where others were evaluated more often: it has only just begun.
+    """Game -> its `comparable` learning curves at equal steps; None where there is no step that all have.
 
     Raises:
         ConfigError: the evaluations of a run are not in ascending order.
     """
     found: dict[str, Comparison | None] = {}
     for game, by_arm in collect.grouped(runs).items():
-        members = [
-            run for arm in arms for run in by_arm.get(arm, []) if len(collect.steps_and_returns(run)[0])
-        ]
-        members = [run for run in members if len(collect.steps_and_returns(run)[0]) > 1] or members
+        members = collect.comparable([run for arm in arms for run in by_arm.get(arm, [])])
         if not members:
             continue
         curves = [collect.steps_and_returns(run) for run in members]

@@ -104,7 +104,8 @@ def performance_profile(scores: Scores, thresholds: Sequence[float], of: str = "
         return (_game_means(scores)[..., None] > thresholds).mean(-2)
     if of != "runs":
         raise ValueError(f"of={of!r}: must be runs or games")
-    return np.mean([(x[..., None] > thresholds).mean(-2) for x in by_game(scores).values()], axis=0)
+    games = by_game(scores)
+    return sum((x[..., None] > thresholds).mean(-2) for x in games.values()) / len(games)
 
 
 AGGREGATES: dict[str, Statistic] = {
