@@ -78,16 +78,20 @@ def test_a_run_that_has_only_begun_cuts_no_curve(runs):
     assert alone["equal_until"] == 0 and alone["arms"]["a"]["mean"] == [7.0]
 
 
-def test_the_report_has_the_same_numbers(runs):
-    entry = _evaluated(runs)["games"]["Catch"]["arms"]
-    found = [run for run in collect.load_runs(runs) if run.arm in ("a", "b")]
-    for row in rows(compare(found, ["a", "b"]), ["a", "b"], "a", {}):
-        mine = entry[row.arm]
-        assert tuple(mine["at_the_end"].values()) == row.final
-        assert tuple(mine["area_under_curve"].values()) == row.area
-    against = entry["b"]["against_baseline"]
-    assert tuple(against["at_the_end"].values()) == row.final_difference
-    assert tuple(against["area_under_curve"].values()) == row.area_difference
+def test_the_report_has_the_same_numbers(tmp_path):
+    # Five seeds, and returns that are all different: limits then depend on every draw.
+    returns = np.random.default_rng(0).normal(size=(10, 3))
+    for i, arm in enumerate("ab"):
+        for seed in range(5):
+            mode = "joint" if arm == "b" else "rl_only"
+            write_run(tmp_path / f"Catch/{arm}/seed{seed}", returns[5 * i + seed], seed=seed, mode=mode)
+    mine = _evaluated(tmp_path)["games"]["Catch"]["arms"]
+    a, b = rows(compare(collect.load_runs(tmp_path), ["a", "b"]), ["a", "b"], "a", {})
+    pairs = [(mine["a"], a.final, a.area), (mine["b"], b.final, b.area)]
+    pairs.append((mine["b"]["against_baseline"], b.final_difference, b.area_difference))
+    for numbers, final, area in pairs:
+        assert tuple(numbers["at_the_end"].values()) == final
+        assert tuple(numbers["area_under_curve"].values()) == area
 
 
 def test_other_games_and_arms_without_runs_are_left_out(runs):
