@@ -162,11 +162,12 @@ def for_real(folder: Path, say: Say) -> Count:
     if mount.returncode:
         return Count(what, 0, 0, "skipped: this process may not mount one")
     try:
-        alone = kills.reference(folder / "alone", "Catch", environment, say)
+        flags = kills.flags_of("Catch")
+        alone = kills.reference(folder / "alone", flags, environment)
         ends = []
         for size in ("4m", "6m", "9m", "14m", "200m"):
             subprocess.run(["mount", "-o", f"remount,size={size}", str(disk)], check=True)
-            command = kills.command(folder / "digest", kills.flags_of("Catch"))
+            command = kills.command(folder / "digest", flags)
             command = [
                 part.replace(f"--out={folder / 'digest'}", f"--out={disk / 'run'}") for part in command
             ]
