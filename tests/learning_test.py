@@ -13,7 +13,6 @@ from srl_jax.config import Config
 from srl_jax.metrics import read_metrics
 
 SHORT = {"steps": 24_000, "eval_every": 24_000, "eval_games": 200, "eps_anneal_steps": 8_000}
-HALF = {"steps": 12_000, "eval_every": 12_000, "eps_anneal_steps": 4_000}
 
 
 def run(path, preset, **overrides):
@@ -38,9 +37,8 @@ def test_rl_only(rl_only):
 
 
 def test_joint(tmp_path):
-    # Five seeds end at -0.23 to -0.06.
-    rows, final = run(tmp_path / "joint", "catch/joint", **HALF)
-    assert rows[0]["eval/return_mean"] < -0.4 and final > -0.35
+    rows, final = run(tmp_path / "joint", "catch/joint")
+    assert final > -0.2
     losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
     assert losses[-1] < 0.6 * losses[0]
 
@@ -52,8 +50,10 @@ def test_on_the_encoder_of_an_rl_run(rl_only, tmp_path, mode):
     # forget it at the preset's (-0.60) and, over four seeds, at 1e-4 (-0.46 to -0.11); at 3e-5 they end at
     # -0.12 to 0.32. From scratch it does not find it.
     source, _ = rl_only
-    rate = {"lr_srl": 3e-5} if mode == "decoupled" else {}
-    _, final = run(tmp_path / mode, f"catch/{mode}", encoder_from=str(source), **HALF, **rate)
+    short = {"steps": 12_000, "eval_every": 12_000, "eps_anneal_steps": 4_000}
+    if mode == "decoupled":
+        short["lr_srl"] = 3e-5
+    _, final = run(tmp_path / mode, f"catch/{mode}", encoder_from=str(source), **short)
     assert final > -0.45
 
 
