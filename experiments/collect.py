@@ -103,7 +103,8 @@ def comparable(runs: Sequence[RunData]) -> list[RunData]:
     """
     points = [len(steps_and_returns(run)[0]) for run in runs]
     under_way = {run.game for run, count in zip(runs, points, strict=True) if count > 1}
-    return [run for run, count in zip(runs, points, strict=True) if count > (run.game in under_way)]
+    needed = [2 if run.game in under_way else 1 for run in runs]
+    return [run for run, count, least in zip(runs, points, needed, strict=True) if count >= least]
 
 
 def check_arms(runs: Sequence[RunData]) -> None:

@@ -75,10 +75,10 @@ def evaluated(
         ConfigError: runs cannot be compared.
     """
     names = [arm.name for arm in figure.arms]
-    runs = comparable([run for run in runs if run.arm in names and run.game in games])
+    runs = [run for run in runs if run.arm in names and run.game in games and len(steps_and_returns(run)[0])]
     collect.check_arms(runs)
     forced = collect.check_protocols(runs, force=force)
-    groups = collect.grouped(runs)
+    groups = collect.grouped(comparable(runs))
     result: dict[str, Any] = {
         "figure": figure.name,
         "title": figure.title,

@@ -113,6 +113,12 @@ def test_other_protocols_are_refused_unless_forced(runs):
     assert "eval_games" in _evaluated(runs, force=True)["forced"][0]
 
 
+def test_a_run_that_has_only_begun_is_checked_like_the_others(runs):
+    write_run(runs / "Catch/b/seed9", (0,), seed=9, mode="joint", sticky_actions=0.25)
+    with pytest.raises(ConfigError, match="sticky_actions"):
+        _evaluated(runs)
+
+
 def test_the_same_runs_give_the_same_bytes(runs, tmp_path):
     pytest.importorskip("matplotlib")
     made = []
