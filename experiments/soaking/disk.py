@@ -163,6 +163,7 @@ def for_real(folder: Path, say: Say) -> Count:
         return Count(what, 0, 0, "skipped: this process may not mount one")
     try:
         flags = kills.flags_of("Catch")
+        say("disk: Catch, left alone")
         alone = kills.reference(folder / "alone", flags, environment)
         ends = []
         for size in ("4m", "6m", "9m", "14m", "200m"):

@@ -51,7 +51,8 @@ ARMS = {
 SHORT = ("--steps=1200",)
 """Enough for the buffer to wrap."""
 SHORT_SEED = 12144
-"""Draws a fault in the third checkpoint, a kill soon after the run went on, and one near its end."""
+"""Found by trying: draws a fault in the third checkpoint, a kill soon after the run went on, and one near its
+end. With other `POINTS` it draws something else, and the short version may take more runs."""
 KILLS = 110
 FAULTS = 45
 """Of the kills, those inside a checkpoint being written."""
