@@ -22,7 +22,7 @@ FEW_ROWS = 16
 def uniform_fan_in(fan_in: int):
     """An initialiser: U(-1/sqrt(fan_in), 1/sqrt(fan_in)), for kernels and biases alike.
 
-    PyTorch's default for linear and convolutional layers, which the thesis ran with.
+    PyTorch's default for linear and convolutional layers, which the thesis ran with, and dqn_zoo's.
     """
     bound = 1.0 / math.sqrt(fan_in)
 
@@ -36,8 +36,7 @@ def he_normal(fan_in: float):
     """An initialiser: a normal of variance 2 / fan_in, truncated at two deviations; for kernels below a ReLU.
 
     It keeps the size of a signal through convolutions and ReLU (He et al. 2015, equation 10). PyTorch's
-    default shrinks it 2.4 times a layer, which goes unnoticed with pixels in 0..255, as the thesis' code has
-    them.
+    default shrinks it 2.4 times a layer.
     """
     std = math.sqrt(2.0 / fan_in)
 
@@ -46,6 +45,18 @@ def he_normal(fan_in: float):
         return std / 0.8796 * jax.random.truncated_normal(key, -2.0, 2.0, shape, dtype)
 
     return init
+
+
+def zeros(key: Array, shape: tuple, dtype=jnp.float32) -> Array:
+    """An initialiser: 0. flax's own is float64 where jax may use 64 bits."""
+    return jnp.zeros(shape, dtype)
+
+
+INITIALISERS = {
+    "pytorch": lambda fan_in: (uniform_fan_in(fan_in), uniform_fan_in(fan_in)),
+    "he": lambda fan_in: (he_normal(fan_in), zeros),
+}
+"""{name: fan_in -> (the initialiser of a convolution's kernel, that of its bias)}."""
 
 
 def zero_sum(init):
@@ -62,6 +73,11 @@ def zero_sum(init):
         return kernel - jnp.mean(kernel, (0, 1), keepdims=True)
 
     return centred
+
+
+def scaled(init, factor: float):
+    """Another initialiser's values, multiplied."""
+    return lambda key, shape, dtype=jnp.float32: factor * init(key, shape, dtype)
 
 
 class Dense(nn.Module):
@@ -93,32 +109,34 @@ class WideDense(nn.Module):
         init = uniform_fan_in(inputs)
         kernel = self.param("kernel", init, (self.features, inputs))
         bias = self.param("bias", init, (self.features,))
-        return x @ kernel.T + jnp.ones((x.shape[0], 1)) @ bias[None, :]
+        return x @ kernel.T + jnp.ones((x.shape[0], 1), x.dtype) @ bias[None, :]
 
 
 class Conv(nn.Module):
-    """A VALID convolution, float32 [B, H, W, C] -> [B, H', W', features]; `he_normal`, biases 0.
+    """A VALID convolution, float32 or uint8 [B, H, W, C] -> float32 [B, H', W', features].
 
     Attributes:
         features: output channels.
         kernel, stride: in pixels.
-        on_image: whether the input is an image, float32 or uint8; its kernels then start `zero_sum`.
+        init: a key of `INITIALISERS`.
+        zero_sum: whether its kernels start with a sum of 0, see `zero_sum`.
         gain: factor of the input.
     """
 
     features: int
     kernel: int
     stride: int
-    on_image: bool = False
+    init: str = "pytorch"
+    zero_sum: bool = False
     gain: float = 1.0
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        init = he_normal(self.kernel**2 * x.shape[-1])
-        if self.on_image:
+        init, bias_init = INITIALISERS[self.init](self.kernel**2 * x.shape[-1])
+        if self.zero_sum:
             init = zero_sum(init)
         kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        bias = self.param("bias", bias_init, (self.features,))
         return _valid_conv(x, kernel * self.gain, self.stride) + bias
 
 
@@ -135,13 +153,15 @@ class ConvTranspose(nn.Module):
         stride: the factor by which the image grows.
         size: side of the output, in pixels; at least `(h - 1) * stride + kernel`, and less than `stride`
             above it (what PyTorch calls output padding): what the mirrored layer saw.
-        init_scale: factor of the kernel's initial values, `he_normal`'s.
+        init: a key of `INITIALISERS`.
+        init_scale: factor of the kernel's initial values.
     """
 
     features: int
     kernel: int
     stride: int
     size: int
+    init: str = "pytorch"
     init_scale: float = 1.0
 
     @nn.compact
@@ -151,9 +171,9 @@ class ConvTranspose(nn.Module):
         if not 0 <= self.size - ((height - 1) * s + k) < s:
             raise ValueError(f"a kernel of {k} with stride {s} cannot make {self.size} pixels from {height}")
         fan_in = max(1, k // s) ** 2 * channels  # the inputs that reach an output pixel
-        init = he_normal(fan_in / self.init_scale**2)
-        kernel = self.param("kernel", init, (k, k, channels, self.features))
-        bias = self.param("bias", nn.initializers.zeros, (self.features,))
+        init, bias_init = INITIALISERS[self.init](fan_in)
+        kernel = self.param("kernel", scaled(init, self.init_scale), (k, k, channels, self.features))
+        bias = self.param("bias", bias_init, (self.features,))
         taps = -(-k // s)
         kernel = jnp.pad(kernel, [(0, taps * s - k)] * 2 + [(0, 0)] * 2)
         kernel = kernel.reshape(taps, s, taps, s, channels, self.features)[::-1, :, ::-1]
@@ -169,7 +189,7 @@ class ConvTranspose(nn.Module):
 
 def factorised_noise(key: Array, size: int) -> Array:
     """f(e) = sign(e) sqrt(|e|) of standard normal e, float32 [size] (Fortunato et al. 2018, equation 11)."""
-    noise = jax.random.normal(key, (size,))
+    noise = jax.random.normal(key, (size,), jnp.float32)
     noise = jnp.sign(noise) * jnp.sqrt(jnp.abs(noise))
     if not size:
         return noise
@@ -197,7 +217,7 @@ class NoisyDense(nn.Module):
         """float32 [B, inputs], and `factorised_noise` [inputs + features] or None -> [B, features]."""
         inputs = x.shape[-1]
         init = uniform_fan_in(inputs)
-        sigma = nn.initializers.constant(self.std / math.sqrt(inputs))
+        sigma = nn.initializers.constant(self.std / math.sqrt(inputs), jnp.float32)
         kernel = self.param("kernel", init, (inputs, self.features))
         bias = self.param("bias", init, (self.features,))
         kernel_sigma = self.param("kernel_sigma", sigma, (inputs, self.features))

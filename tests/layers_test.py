@@ -189,9 +189,9 @@ def test_he_normal_keeps_the_size_of_a_signal():
 
 def test_every_layer_knows_its_fan_in(monkeypatch):
     fans = []
-    record = lambda n: fans.append(n) or jax.nn.initializers.zeros  # noqa: E731
+    record = lambda n: fans.append(n) or layers.zeros  # noqa: E731
     monkeypatch.setattr(layers, "uniform_fan_in", record)
-    monkeypatch.setattr(layers, "he_normal", record)
+    monkeypatch.setitem(layers.INITIALISERS, "pytorch", lambda n: (record(n), layers.zeros))
     cases = [
         (Dense(7), (1, 25), 25),
         (WideDense(7), (1, 25), 25),
@@ -206,10 +206,24 @@ def test_every_layer_knows_its_fan_in(monkeypatch):
         assert fans.pop() == fan_in and not fans
 
 
+def test_a_convolution_starts_as_asked():
+    def start(**options):
+        return jit(Conv(64, 5, 1, **options).init)(jax.random.key(0), jnp.zeros((1, 5, 5, 4)))["params"]
+
+    # PyTorch's default, kaiming_uniform with a = sqrt(5): U(-1/sqrt(fan_in), 1/sqrt(fan_in)), 5 * 5 * 4 = 100.
+    textbook, he, centred = start(), start(init="he"), start(zero_sum=True)
+    for leaf in (textbook["kernel"], textbook["bias"]):
+        assert 0.09 < np.abs(leaf).max() <= 0.1
+    np.testing.assert_allclose(textbook["kernel"].std(), 0.1 / 3**0.5, rtol=0.03)
+    np.testing.assert_allclose(he["kernel"].std(), (2 / 100) ** 0.5, rtol=0.03)
+    assert not he["bias"].any() and np.abs(textbook["kernel"].sum((0, 1))).max() > 0.1
+    assert np.abs(centred["kernel"].sum((0, 1))).max() < 1e-6
+
+
 def test_init_scale_multiplies_the_kernel():
     x = jnp.zeros((1, 3, 3, 2))
     whole, tenth = (
-        jit(ConvTranspose(4, 4, 2, 8, init_scale=scale).init)(jax.random.key(0), x)["params"]
+        jit(ConvTranspose(4, 4, 2, 8, "he", scale).init)(jax.random.key(0), x)["params"]
         for scale in (1.0, 0.1)
     )
     np.testing.assert_allclose(tenth["kernel"], 0.1 * whole["kernel"], rtol=1e-5)

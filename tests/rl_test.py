@@ -79,11 +79,17 @@ def softmax(x):
 
 
 @pytest.mark.parametrize(
-    ("distributional", "double", "dueling", "n_step"),
-    [(True, True, True, 3), (True, False, False, 2), (False, True, False, 3), (False, False, True, 1)],
+    ("distributional", "double", "dueling", "n_step", "priority"),
+    [
+        (True, True, True, 3, "kl"),
+        (True, False, False, 2, "cross_entropy"),
+        (False, True, False, 3, "kl"),
+        (False, False, True, 1, "cross_entropy"),
+    ],
 )
-def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step):
+def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step, priority):
     parts = {"distributional": distributional, "double": double, "dueling": dueling, "n_step": n_step}
+    parts["priority"] = priority
     algorithm = rl.rainbow(CONTEXT, noisy=False, **parts, **SMALL)
     objective = algorithm.objective
     head, slow_head = (random_params(objective.init, seed) for seed in (1, 2))
@@ -118,7 +124,8 @@ def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step
             )
             best = softmax(slow_t[selector.argmax()])
             target = np.asarray(rlax.categorical_l2_project(total + discount * atoms, best, atoms))
-            td_error.append(np.sum(target * np.log((target + 1e-30) / softmax(out_tm1)[action])))  # KL
+            target_entropy = -np.sum(target * np.log(target + 1e-30))
+            td_error.append(float(loss) - (target_entropy if priority == "kl" else 0))
             unweighted.append(float(loss))
         else:
             loss = rlax.double_q_learning(
@@ -278,8 +285,13 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
         ({"hidden": 0}, "hidden"),
         ({"atoms": 1}, "atoms"),
         ({"v_min": 1.0, "v_max": 1.0}, "v_min must be below v_max"),
-        ({"init_std": -1.0}, "init_std must be 0 or at least 0.001"),
-        ({"init_std": 1e-30}, "init_std must be 0 or at least 0.001"),
+        ({"init_std": -1.0}, "init_std must be 0 or at least 0.4, the distance of two atoms"),
+        ({"init_std": 0.3}, "init_std must be 0 or at least 0.4, the distance of two atoms"),
+        ({"init_std": 1.0, "v_min": -100.0, "v_max": 100.0}, "init_std must be 0 or at least 4"),
+        ({"v_min": 1e6, "v_max": 1e6 + 1}, "float32 has no 51 evenly spaced atoms from 1e"),
+        ({"v_min": -3e38, "v_max": 3e38}, "float32 has no 51 evenly spaced atoms"),
+        ({"v_min": 0.0, "v_max": 1e-44}, "float32 has no 51 evenly spaced atoms"),
+        ({"priority": "entropy"}, "priority: .*valid: cross_entropy, kl"),
         ({"alpha": 1.5}, "alpha must be at most 1"),
         ({"hidden": 2**16 + 1}, "hidden must be at least 1 and at most 65536"),
         ({"atoms": 2**31 - 1}, "atoms must be at least 2 and at most 65536"),
@@ -288,5 +300,5 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
 def test_options_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         rl.rainbow(CONTEXT, **options)
-    if "atoms" in options or "v_min" in options:  # the support matters only where there is one
+    if ("atoms" in options or "v_min" in options) and "init_std" not in options:  # the support matters only where there is one
         rl.rainbow(CONTEXT, distributional=False, **options)

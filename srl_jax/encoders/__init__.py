@@ -1,25 +1,43 @@
 """The encoders: `REGISTRY[name](observation_shape, **options) -> Encoder`, a row each.
 
-`observation_shape` is (H, W, S). Each comes with the decoder that mirrors it.
+`observation_shape` is (H, W, S). Each comes with the decoder that mirrors it, and all have the options
+`init`, `zero_sum`, `gain` and `decoder_scale`: see `srl_jax.encoders.convolutional.Start`.
 """
 
-from srl_jax.encoders.convolutional import Layer, convolutional_encoder
+from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
 __all__ = ["REGISTRY", "nature", "sac_ae", "tiny"]
 
 
-def nature(observation_shape: tuple) -> Encoder:
+def nature(
+    observation_shape: tuple,
+    *,
+    init: str = "pytorch",
+    zero_sum: bool = False,
+    gain: float = 1.0,
+    decoder_scale: float = 1.0,
+) -> Encoder:
     """The encoder of Mnih et al. (2015): no bottleneck, 3,136 features at 84 x 84.
 
     Its decoder ends in a sigmoid, as in the thesis' code.
     """
     layers = [Layer(32, 8, 4), Layer(64, 4, 2), Layer(64, 3, 1)]
-    return convolutional_encoder(observation_shape, layers, sigmoid=True)
+    start = Start(init, zero_sum, gain, decoder_scale)
+    return convolutional_encoder(observation_shape, layers, start, sigmoid=True)
 
 
-def sac_ae(observation_shape: tuple, *, features: int = 256, layer_norm: bool = True) -> Encoder:
+def sac_ae(
+    observation_shape: tuple,
+    *,
+    features: int = 256,
+    layer_norm: bool = True,
+    init: str = "pytorch",
+    zero_sum: bool = False,
+    gain: float = 1.0,
+    decoder_scale: float = 1.0,
+) -> Encoder:
     """The thesis' larger encoder, after SAC-AE (Yarats et al. 2021, appendix B.2).
 
     Args:
@@ -31,10 +49,19 @@ def sac_ae(observation_shape: tuple, *, features: int = 256, layer_norm: bool = 
     """
     check_size("features", features)
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
-    return convolutional_encoder(observation_shape, layers, features=features, layer_norm=layer_norm)
+    start = Start(init, zero_sum, gain, decoder_scale)
+    return convolutional_encoder(observation_shape, layers, start, features=features, layer_norm=layer_norm)
 
 
-def tiny(observation_shape: tuple, *, features: int = 64) -> Encoder:
+def tiny(
+    observation_shape: tuple,
+    *,
+    features: int = 64,
+    init: str = "pytorch",
+    zero_sum: bool = False,
+    gain: float = 1.0,
+    decoder_scale: float = 1.0,
+) -> Encoder:
     """A small encoder for tests and for Catch: two convolutions and a bottleneck.
 
     Args:
@@ -45,7 +72,8 @@ def tiny(observation_shape: tuple, *, features: int = 64) -> Encoder:
     """
     check_size("features", features, least=0)
     layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
-    return convolutional_encoder(observation_shape, layers, features=features)
+    start = Start(init, zero_sum, gain, decoder_scale)
+    return convolutional_encoder(observation_shape, layers, start, features=features)
 
 
 REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny}

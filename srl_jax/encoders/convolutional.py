@@ -6,21 +6,12 @@ from typing import NamedTuple
 import flax.linen as nn
 import jax.numpy as jnp
 
-from srl_jax.layers import Conv, ConvTranspose, Dense, WideDense
+from srl_jax.layers import INITIALISERS, Conv, ConvTranspose, Dense, WideDense
+from srl_jax.specs import choices_text
 from srl_jax.types import Array, Decoder, Encoder
 
 LEAST_SEEN = 0.95
 """The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
-
-INPUT_GAIN = 32.0
-"""Pixels in [0, 1] are multiplied by it, so that latents are of the order of 1 and differ from frame to
-frame by tenths: between frames only a ball and two paddles may change, a hundredth of the pixels."""
-
-OUTPUT_SCALE = 0.1
-"""Of the initial kernel of a decoder's last layer. At full size the first images are all contrast, and
-unlearning it leaves a decoder that ignores the latent: on frames of Catch, `tiny` gives the same black image
-(squared error 0.0051) for thousands of updates; with this the error is 0.0018 after 500."""
-
 
 class Layer(NamedTuple):
     """One convolution: output channels, side of the kernel and stride, both in pixels."""
@@ -30,26 +21,60 @@ class Layer(NamedTuple):
     stride: int
 
 
+class Start(NamedTuple):
+    """How an encoder and its decoder start, and what the encoder sees; the defaults are the textbook's.
+
+    Attributes:
+        init: how convolutions start, a key of `srl_jax.layers.INITIALISERS`.
+        zero_sum: whether the first layer's kernels start with a sum of 0, see `srl_jax.layers.zero_sum`.
+        gain: factor of the pixels, which are in [0, 1] before it. Between the frames of a game only a ball
+            and two paddles may move, a hundredth of the pixels; with a gain of 32 latents then differ by
+            tenths.
+        decoder_scale: factor of the initial kernel of the decoder's last layer. At full size the first
+            images are all contrast; a tenth starts near black.
+
+    Raises:
+        ValueError: from `check`, where a value is out of range.
+    """
+
+    init: str = "pytorch"
+    zero_sum: bool = False
+    gain: float = 1.0
+    decoder_scale: float = 1.0
+
+    def check(self) -> None:
+        if self.init not in INITIALISERS:
+            raise ValueError(f"init: {choices_text(self.init, INITIALISERS)}")
+        for name in ("gain", "decoder_scale"):
+            if not 1e-3 <= getattr(self, name) <= 1e3:
+                raise ValueError(f"{name} must be at least 0.001 and at most 1000")
+
+
 class EncoderNetwork(nn.Module):
     """Convolutions with ReLU, flatten, and an optional bottleneck: linear, LayerNorm, tanh.
 
     Attributes:
         layers: the convolutions, from the image on.
+        start: of the convolutions.
         features: the bottleneck's size; 0 leaves it out, and the flattened maps are the latent.
         layer_norm: LayerNorm between the bottleneck's linear layer and its tanh, as in SAC-AE.
     """
 
     layers: Sequence[Layer]
+    start: Start
     features: int = 0
     layer_norm: bool = True
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
         x = observation
-        gain = INPUT_GAIN / 255.0 if x.dtype == jnp.uint8 else INPUT_GAIN
+        init, zero_sum, gain, _ = self.start
+        if x.dtype == jnp.uint8:
+            gain /= 255.0
         for i, layer in enumerate(self.layers):
             # The first kernel is multiplied by the gain, not the image: the same, with fewer bytes.
-            x = nn.relu(Conv(*layer, on_image=i == 0, gain=1.0 if i else gain)(x))
+            first = {"zero_sum": zero_sum, "gain": gain} if i == 0 else {}
+            x = nn.relu(Conv(*layer, init, **first)(x))
         x = x.reshape(x.shape[0], -1)
         if not self.features:
             return x
@@ -67,6 +92,7 @@ class DecoderNetwork(nn.Module):
 
     Attributes:
         layers: the encoder's.
+        start: the encoder's.
         sizes: side of each layer's input in the encoder, image first, and the last layer's output's.
         channels: the image's channels.
         latent: the latent's size, without the extra inputs.
@@ -75,6 +101,7 @@ class DecoderNetwork(nn.Module):
     """
 
     layers: Sequence[Layer]
+    start: Start
     sizes: Sequence[int]
     channels: int
     latent: int
@@ -94,8 +121,8 @@ class DecoderNetwork(nn.Module):
         outputs = [self.channels] + [layer.channels for layer in self.layers[:-1]]
         for i in reversed(range(len(self.layers))):
             _, kernel, stride = self.layers[i]
-            scale = 1.0 if i else OUTPUT_SCALE
-            x = ConvTranspose(outputs[i], kernel, stride, self.sizes[i], scale)(x)
+            scale = 1.0 if i else self.start.decoder_scale
+            x = ConvTranspose(outputs[i], kernel, stride, self.sizes[i], self.start.init, scale)(x)
             if i:
                 x = nn.relu(x)
         return nn.sigmoid(x) if self.sigmoid else x
@@ -104,6 +131,7 @@ class DecoderNetwork(nn.Module):
 def convolutional_encoder(
     observation_shape: tuple,
     layers: Sequence[Layer],
+    start: Start,
     *,
     features: int = 0,
     layer_norm: bool = True,
@@ -114,14 +142,16 @@ def convolutional_encoder(
     Args:
         observation_shape: (H, W, S), with H = W.
         layers: its convolutions.
+        start: how it starts.
         features: size of the bottleneck; 0 for none.
         layer_norm: see `EncoderNetwork`.
         sigmoid: whether the decoder ends in a sigmoid (in (0, 1)) or is linear at the end.
 
     Raises:
         ValueError: where the image is not square, too small for the layers, or the layers' strides leave
-            out more of its last rows and columns than 1 in 20.
+            out more of its last rows and columns than 1 in 20; or `start` is out of range.
     """
+    start.check()
     height, width, channels = observation_shape
     if height != width:
         raise ValueError(f"frames must be square, not {height} x {width}")
@@ -141,13 +171,13 @@ def convolutional_encoder(
             f"{seen} fits"
         )
     layers, sizes = tuple(layers), tuple(sizes)
-    network = EncoderNetwork(layers, features, layer_norm)
+    network = EncoderNetwork(layers, start, features, layer_norm)
     latent = features or sizes[-1] ** 2 * layers[-1].channels
-    image = jnp.zeros((1, *observation_shape))
+    image = jnp.zeros((1, *observation_shape), jnp.float32)
 
     def make_decoder(extra_inputs: int = 0) -> Decoder:
-        decoder = DecoderNetwork(layers, sizes, channels, latent, bool(features), sigmoid)
-        z = jnp.zeros((1, latent + extra_inputs))
+        decoder = DecoderNetwork(layers, start, sizes, channels, latent, bool(features), sigmoid)
+        z = jnp.zeros((1, latent + extra_inputs), jnp.float32)
         return Decoder(
             init=lambda key: decoder.init(key, z)["params"],
             apply=lambda params, x: decoder.apply({"params": params}, x),

@@ -11,19 +11,20 @@ import numpy as np
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.losses import categorical_q_learning, categorical_target, entropy, huber, q_learning
 from srl_jax.rl.losses import n_step as n_step_view
-from srl_jax.specs import check_size
+from srl_jax.specs import check_size, choices_text
 from srl_jax.types import Context, Latents, Objective, Window
 
 __all__ = ["REGISTRY", "Algorithm", "normal_logits", "rainbow"]
+
+
+PRIORITIES = ("cross_entropy", "kl")
 
 
 class Algorithm(NamedTuple):
     """An RL algorithm: its term of the loss, how it values actions, and what it asks of replay.
 
     Attributes:
-        objective: the loss; its metrics are `td_error` float32 [B] (what priorities are made of: the
-            temporal-difference error, or the Kullback-Leibler divergence of the value distribution from its
-            target, as in Hessel et al. 2018, section 3) and
+        objective: the loss; its metrics are `td_error` float32 [B], what priorities are made of, and
             `q_max_mean`, a scalar: the mean over the batch of the largest value of s_t.
         q_values: (head, latents [B, D], key | None) -> float32 [B, A]; without a key, without noise.
         alpha: the priority exponent; 0 where replay is uniform.
@@ -46,9 +47,10 @@ def rainbow(
     atoms: int = 51,
     v_min: float = -10.0,
     v_max: float = 10.0,
-    init_std: float = 1.0,
+    init_std: float = 0.0,
     noisy_std: float = 0.1,
     alpha: float = 0.5,
+    priority: str = "cross_entropy",
     hidden: int = 512,
 ) -> Algorithm:
     """Rainbow (Hessel et al. 2018), each part of which can be left out alone.
@@ -63,34 +65,36 @@ def rainbow(
         n_step: steps of reward before bootstrapping.
         atoms, v_min, v_max: the value distribution's support, in units of (discounted) reward.
         init_std: the value distribution starts near a normal around 0 of this standard deviation, in units of
-            reward; 0: near uniform, as in C51. See `normal_logits`.
+            reward, at least the distance of two atoms; 0: near uniform, as in C51. See `normal_logits`.
         noisy_std: see `srl_jax.layers.NoisyDense`.
         alpha: the priority exponent (Schaul et al. 2016).
+        priority: what the priorities of a value distribution are made of: "cross_entropy" with its target,
+            the loss itself, as Dopamine, dqn_zoo and the thesis have it, or "kl", the Kullback-Leibler
+            divergence (Hessel et al. 2018, section 3), which leaves out the target's own entropy. Without a
+            distribution they are made of the temporal-difference error.
         hidden: width of each stream's hidden layer.
 
     Raises:
-        ValueError: where n_step is 0, hidden or atoms is out of range, v_min is not below v_max, init_std is
-            too small for float32, or alpha is above 1.
+        ValueError: where n_step is 0, hidden or atoms is out of range, v_min is not below v_max, float32 has
+            no such atoms, init_std is below their distance, alpha is above 1, or priority is unknown.
     """
     if n_step < 1:
         raise ValueError("n_step must be at least 1")
     check_size("hidden", hidden)
     if distributional:
         check_size("atoms", atoms, least=2)
-    if distributional and v_min >= v_max:
-        raise ValueError(f"v_min must be below v_max, not {v_min} and {v_max}")
-    if init_std and not init_std >= 1e-3:
-        raise ValueError("init_std must be 0 or at least 0.001")
     if alpha > 1:
         raise ValueError("alpha must be at most 1")
-    support = np.linspace(v_min, v_max, atoms, dtype=np.float32) if distributional else None
+    if priority not in PRIORITIES:
+        raise ValueError(f"priority: {choices_text(priority, PRIORITIES)}")
+    support = make_support(v_min, v_max, atoms) if distributional else None
     prior = normal_logits(support, init_std) if distributional and init_std else None
     network = QNetwork(
         context.num_actions, atoms if distributional else 1, hidden, dueling, noisy, noisy_std, prior
     )
 
     def init(key):
-        return network.init(key, jnp.zeros((1, context.encoder.features)), None)["params"]
+        return network.init(key, jnp.zeros((1, context.encoder.features), jnp.float32), None)["params"]
 
     def expected(output):  # [B, A, M] -> [B, A]
         if distributional:
@@ -119,11 +123,12 @@ def rainbow(
             losses = jax.vmap(categorical_q_learning, (0, None, 0, 0, 0, 0, 0))(
                 out_tm1, support, a_tm1, r_t, discount_t, slow_t, selector_t
             )
-            # The KL divergence; the target's entropy says how random a return is, not how surprising.
-            target = jax.vmap(categorical_target, (None, 0, 0, 0, 0))(
-                support, r_t, discount_t, slow_t, selector_t
-            )
-            td_error = jnp.maximum(losses - jax.vmap(entropy)(target), 0.0)
+            td_error = losses
+            if priority == "kl":  # the target's entropy says how random a return is, not how surprising
+                target = jax.vmap(categorical_target, (None, 0, 0, 0, 0))(
+                    support, r_t, discount_t, slow_t, selector_t
+                )
+                td_error = jnp.maximum(losses - jax.vmap(entropy)(target), 0.0)
         else:
             td_error = jax.vmap(q_learning)(
                 out_tm1[..., 0], a_tm1, r_t, discount_t, slow_t[..., 0], selector_t
@@ -140,6 +145,24 @@ def rainbow(
     )
 
 
+def make_support(v_min: float, v_max: float, atoms: int) -> np.ndarray:
+    """The atoms of a value distribution: evenly spaced, float32 [atoms].
+
+    Raises:
+        ValueError: v_min is not below v_max, or float32 cannot hold such atoms, evenly spaced to a hundredth.
+    """
+    if v_min >= v_max:
+        raise ValueError(f"v_min must be below v_max, not {v_min} and {v_max}")
+    support = np.linspace(v_min, v_max, atoms, dtype=np.float32)
+    spacing = (v_max - v_min) / (atoms - 1)
+    with np.errstate(all="ignore"):
+        uneven = np.abs(np.diff(support) / np.float32(spacing) - 1).max()
+        width = support[-1] - support[0]
+    if not (np.isfinite(width) and np.float32(spacing) > 0 and uneven < 0.01):
+        raise ValueError(f"float32 has no {atoms} evenly spaced atoms from {v_min:g} to {v_max:g}")
+    return support
+
+
 def normal_logits(atoms: np.ndarray, std: float) -> tuple[float, ...]:
     """The logits of a normal distribution over atoms, around 0 (or the atom nearest to it).
 
@@ -148,13 +171,22 @@ def normal_logits(atoms: np.ndarray, std: float) -> tuple[float, ...]:
     narrows it by discount ** n alone: with the thesis' settings (0.97 every 500 updates) its standard
     deviation is still 3.2 after 10,000 updates, while the values of actions differ by hundredths.
 
+    The logits are constants that the network's own are added to. Where std were less than the distance of
+    two atoms they would be hundreds, and nothing would be learnt.
+
     Args:
-        atoms: float32 [M], ascending returns.
-        std: standard deviation, in units of reward; above 0.
+        atoms: float32 [M], ascending returns, evenly spaced.
+        std: standard deviation, in units of reward.
 
     Returns:
         M logits, the largest 0.
+
+    Raises:
+        ValueError: std is less than the distance of two atoms.
     """
+    spacing = (float(atoms[-1]) - float(atoms[0])) / (len(atoms) - 1)
+    if not std >= spacing * (1 - 1e-6):
+        raise ValueError(f"init_std must be 0 or at least {spacing:g}, the distance of two atoms")
     centre = np.clip(0.0, atoms[0], atoms[-1])
     return tuple((-0.5 * ((atoms.astype(np.float64) - centre) / std) ** 2).tolist())
 

@@ -128,8 +128,8 @@ def n_step(rewards: Array, discounts: Array, valid: Array, n: int):
         discount_t: float32 [...], the product of the discounts; 0 where a terminal state was met.
         offset: int32 [...], where to bootstrap from, 1..n steps after s_t.
     """
-    r_t = jnp.zeros(rewards.shape[:-1])
-    discount_t = jnp.ones(rewards.shape[:-1])
+    r_t = jnp.zeros(rewards.shape[:-1], rewards.dtype)
+    discount_t = jnp.ones(rewards.shape[:-1], discounts.dtype)
     for k in range(n):
         r_t = r_t + valid[..., k] * discount_t * rewards[..., k]
         discount_t = discount_t * jnp.where(valid[..., k] > 0, discounts[..., k], 1.0)
