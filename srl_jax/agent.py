@@ -1,6 +1,6 @@
 """From a configuration to the functions that it means: encoder, objectives, update, act."""
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Sequence
 from functools import wraps
 from typing import NamedTuple
 
@@ -10,72 +10,65 @@ import jax.numpy as jnp
 from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
 from srl_jax.diagnostics.device import Functions, make_functions
-from srl_jax.modes import MODES, Mode, encoder_learning_rate
+from srl_jax.modes import MODES, Mode, encoder_learning_rate, second_learning_rate
 from srl_jax.optim import RL, make_optimizer, real_copy
 from srl_jax.rl import Algorithm
 from srl_jax.types import Context, Encoder, Objective, TrainState, Window
 from srl_jax.update import (
     Hyper,
-    Moving,
+    Pass,
     follow_every,
     make_act,
     make_follow,
     make_init,
     make_update,
+    passes,
     periodic,
-    put_together,
-    take_apart,
 )
 
 
-class JittedUpdate:
-    """A jitted update, (state, window, hyper) -> (state, td_error, metrics).
+def jit_update(
+    update: Callable, plan: Sequence[Pass], lift: Callable[[Callable], Callable] = lambda change: change
+) -> Callable:
+    """Jits an update, (state, window, hyper) -> (state, td_error, metrics), so that nothing is copied.
 
-    It takes over the buffers of the optimizer's state of the groups that move, and no others. What it does
-    not change is no result of the compiled function: XLA would copy it.
+    The optimizer's state of the groups that move is taken over. Parameters are not: they may still act. What
+    does not change is no result of the compiled function, for XLA would copy it.
 
     Args:
-        update: from `make_update`.
-        mode: its mode.
-        active: the names of the objectives that it computes.
-        lift: of the pure function (opt_state, moving, still, window, hyper) -> (Moving, td_error, metrics),
-            to another one that is jitted in its place: see `srl_jax.lockstep`.
-
-    Attributes:
-        pure: `update`.
-        compiled: the jitted function, of such arguments.
+        update: from `make_update`; the result has it as `pure`, and the jitted function as `compiled`.
+        plan: its passes.
+        lift: of the function that is jitted, (opt_state, params, rest, window, hyper) -> (what moved,
+            td_error, metrics), to another one: see `srl_jax.lockstep`.
     """
+    params = {group for one in plan for group in one.groups}
+    opt_state = {moments for one in plan for moments in one.groups.values()}
 
-    def __init__(
-        self,
-        update: Callable,
-        mode: Mode,
-        active: Collection[str],
-        lift: Callable[[Callable], Callable] = lambda change: change,
-    ):
-        self.pure = update
-        self._mode, self._active = mode, active
+    def part(state: TrainState, moves: bool) -> tuple[dict, dict]:
+        """Of the optimizer's state and the parameters, the groups that move, or those that do not."""
+        return tuple(
+            {group: x for group, x in tree.items() if (group in groups) == moves}
+            for tree, groups in ((state.opt_state, opt_state), (state.params, params))
+        )
 
-        def change(opt_state, moving: Moving, still: TrainState, window: Window, hyper: Hyper):
-            state = put_together(moving._replace(opt_state=opt_state), still)
-            new, td_error, metrics = update(state, window, hyper)
-            return take_apart(new, mode, active)[0], td_error, metrics
+    def put(state: TrainState, moved: tuple[dict, dict]) -> TrainState:
+        return state._replace(opt_state=state.opt_state | moved[0], params=state.params | moved[1])
 
-        self.compiled = jax.jit(lift(change), donate_argnums=0)
+    def change(opt_state: dict, params: dict, rest: TrainState, window: Window, hyper: Hyper):
+        new, td_error, metrics = update(put(rest, (opt_state, params)), window, hyper)
+        return (*part(new, True), new.step), td_error, metrics
 
-    def __call__(self, state: TrainState, window: Window, hyper: Hyper):
-        arguments = self.arguments(state, window, hyper)
-        moving, td_error, metrics = self.compiled(*arguments)
-        return put_together(moving, arguments[2]), td_error, metrics
+    compiled = jax.jit(lift(change), donate_argnums=0)
 
-    def arguments(self, state: TrainState, window: Window, hyper: Hyper) -> tuple:
-        """Of `compiled`, from an update's."""
-        moving, still = take_apart(state, self._mode, self._active)
-        return moving.opt_state, moving._replace(opt_state=None), still, window, hyper
+    def jitted(state: TrainState, window: Window, hyper: Hyper):
+        still = part(state, False)
+        rest = state._replace(opt_state=still[0], params=still[1])
+        (*moved, step), td_error, metrics = compiled(*part(state, True), rest, window, hyper)
+        return put(state, moved)._replace(step=step), td_error, metrics
 
-    def lifted(self, lift: Callable[[Callable], Callable]) -> "JittedUpdate":
-        """The same update, lifted."""
-        return JittedUpdate(self.pure, self._mode, self._active, lift)
+    jitted.pure, jitted.compiled = update, compiled
+    jitted.lifted = lambda lift: jit_update(update, plan, lift)
+    return jitted
 
 
 class Agent(NamedTuple):
@@ -109,8 +102,8 @@ class Agent(NamedTuple):
     objectives: dict[str, Objective]
     horizon: int
     init: Callable
-    update: JittedUpdate
-    update_rl: JittedUpdate | None
+    update: Callable
+    update_rl: Callable | None
     follow: Callable
     follow_every: int
     act: Callable
@@ -155,11 +148,12 @@ def make_agent(config: Config, num_actions: int) -> Agent:
     )
     rates = {
         "encoder": encoder_learning_rate(config),
+        "encoder_srl": second_learning_rate(config),
         "rl": config.lr_rl,
         "representation": config.lr_srl,
     }
 
-    def jitted_update(only: Collection[str]) -> JittedUpdate:
+    def jitted_update(only: Collection[str]) -> Callable:
         update = make_update(
             encoder,
             terms,
@@ -167,17 +161,26 @@ def make_agent(config: Config, num_actions: int) -> Agent:
             optimizer,
             augment=config.augment,
             target_encoder=config.target_encoder,
+            encoder_optimizer=config.encoder_optimizer,
             only=only,
             slow_follows=False,
         )
-        return JittedUpdate(update, mode, only)
+        plan = passes(mode, [name for name in terms if name in only], config.encoder_optimizer)
+        return jit_update(update, plan)
 
     def jitted_act(noisy: bool):
         act = make_act(encoder, algorithm.q_values, noisy=noisy)
-        return jax.jit(lambda params, *rest: act(params["encoder"], params["heads"][RL], *rest))
+        return jax.jit(lambda params, *rest: act(params["encoder"], params[RL], *rest))
 
     act = jitted_act(noisy=True)
-    init = make_init(encoder, terms, mode, optimizer, target_encoder=config.target_encoder)
+    init = make_init(
+        encoder,
+        terms,
+        mode,
+        optimizer,
+        target_encoder=config.target_encoder,
+        encoder_optimizer=config.encoder_optimizer,
+    )
     return Agent(
         mode=mode,
         encoder=encoder,

@@ -4,7 +4,7 @@ A checkpoint is a directory, `checkpoints/ENV_STEPS` of a run:
 
     manifest.json     configuration, counts, and of every other file: bytes, sha256, and dtype and shape
     manifest.sha256   the manifest's own, as sha256sum writes and checks it
-    params.msgpack    {"encoder": tree, "heads": {name: tree}}
+    params.msgpack    {"encoder": tree, OBJECTIVE: tree}
     NAME.msgpack, NAME.npy, run.json: what else a run needs to go on, see `srl_jax.snapshot`
 
 It is written to a temporary directory, each file flushed to disk, the manifest last, and renamed. Large
@@ -34,7 +34,7 @@ from srl_jax.reading import parse_json
 from srl_jax.specs import LIMITS
 
 MANIFEST, CHECKSUM, PARAMS, NUMBERS = "manifest.json", "manifest.sha256", "params.msgpack", "run.json"
-FORMAT = 2
+FORMAT = 3
 _NAME = re.compile(r"[a-z0-9_]+\.(msgpack|npy|json)")
 _DTYPES = frozenset(np.dtype(code).str for code in "?bhiqBHIQefd")  # of numbers, as numpy writes them
 _PIECE = 1 << 24  # bytes that are written, or read to be summed, at a time
@@ -109,7 +109,7 @@ def save(
 
     Args:
         run: the run directory.
-        params: {"encoder": tree, "heads": {name: tree}}.
+        params: {"encoder": tree, OBJECTIVE: tree}.
         config, num_actions, env_steps, updates: see `Manifest`.
         state: what else is needed to go on; None where nobody will.
         base: the run's last checkpoint, whose files stand in for `state.unchanged`.
@@ -366,14 +366,14 @@ def newest_good(run: str | Path, say: Callable[[str], None], at_most: int | None
 
 
 def load(manifest: Manifest) -> Any:
-    """The parameters, {"encoder": tree, "heads": {name: tree}}, of numpy arrays.
+    """The parameters, {"encoder": tree, OBJECTIVE: tree}, of numpy arrays.
 
     Raises:
         ConfigError: the file is missing or is not what the manifest says.
     """
     tree = load_tree(manifest, "params")
-    if set(tree) != {"encoder", "heads"}:
-        raise ConfigError(f"{manifest.path / PARAMS}: not parameters: no encoder and heads")
+    if "encoder" not in tree:
+        raise ConfigError(f"{manifest.path / PARAMS}: not parameters: no encoder")
     return tree
 
 

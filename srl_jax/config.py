@@ -71,6 +71,13 @@ class Config:
     srl_every: int = _value(
         int, 1, "representation losses are computed in every so manyth update", "updates", minimum=1
     )
+    encoder_optimizer: str = _value(
+        str, "separate",
+        "how the encoder is stepped where RL and representation both train it; separate: RL's Adam, then the "
+        "representation's own on a fresh encoding, as the thesis' code; simultaneous: both at the same "
+        "parameters; summed: one Adam on the sum",
+        choices=modes.ENCODER_OPTIMIZERS,
+    )  # fmt: skip
     target_encoder: str = _value(
         str, "slow", "encoder under the target network: its slow copy, or the online one",
         choices=("slow", "online"),
@@ -95,6 +102,11 @@ class Config:
     lr_encoder: float = _value(
         float, 0.0,
         "Adam's learning rate of the encoder; 0: lr_rl where RL trains it, else lr_srl",
+        minimum=0,
+    )  # fmt: skip
+    lr_encoder_srl: float = _value(
+        float, 0.0,
+        "learning rate of the encoder's second Adam, the representation's, where it has two; 0: lr_srl",
         minimum=0,
     )  # fmt: skip
     lr_final: float = _share(
@@ -163,6 +175,12 @@ class Config:
     frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1, maximum=256)
 
     encoder_from: str = _value(str, "", "run directory or checkpoint that the encoder starts from")
+    heads_from: str = _value(
+        str, "representation",
+        "heads that also start from --encoder_from, where both runs have them: decoders and other "
+        "representation heads; all: RL's, too",
+        choices=("representation", "all", "none"),
+    )  # fmt: skip
     policy_from: str = _value(
         str, "", "run directory or checkpoint whose policy --mode=pretrain acts with; empty: random"
     )
@@ -283,6 +301,7 @@ def resolve(
         encoder=encoder.full,
         objectives=tuple(objective.full for objective in objectives),
         lr_encoder=modes.encoder_learning_rate(config),
+        lr_encoder_srl=modes.second_learning_rate(config),
         checkpoint_every=config.checkpoint_every or config.eval_every,
     )
 

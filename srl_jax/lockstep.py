@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.agent import Agent, JittedUpdate, make_agent
+from srl_jax.agent import Agent, make_agent
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config
 from srl_jax.loop import Result, Run, make_env
@@ -179,7 +179,7 @@ class Lockstep:
     def _adopt(self) -> Callable:
         return lambda arguments: self._parts(_stack([state for (state,) in arguments]))
 
-    def _update(self, update: JittedUpdate) -> Callable:
+    def _update(self, update: Callable) -> Callable:
         def lift(change: Callable) -> Callable:
             several = jax.vmap(change, in_axes=(0, 0, 0, 0, None))
 

@@ -22,6 +22,7 @@ from srl_jax.config import Config
 from srl_jax.diagnostics.measure import Diagnostics
 from srl_jax.errors import ConfigError, Diverged
 from srl_jax.evaluator import Evaluator, Moment
+from srl_jax.optim import ENCODER, RL
 from srl_jax.replay import Replay
 from srl_jax.reporting import Report
 from srl_jax.types import Params, Window
@@ -144,7 +145,7 @@ class Run:
         self.agent = agent or make_agent(config, self.num_actions)
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.key = jax.random.key(config.seed)
-        self.state = self.agent.init(self.key, self.initial_encoder())
+        self.state = self.agent.init(self.key, self.initial_params())
         frame = self.env.single_observation_space.shape
         try:
             self.replay = Replay(
@@ -450,7 +451,7 @@ class Run:
             return  # it is there already
         if every and self.env_steps // self.checkpoint_every % every == 0:
             self.check_losses()
-            self.save_parameters("encoders", {"encoder": self.state.params["encoder"], "heads": {}}, keep=0)
+            self.save_parameters("encoders", {"encoder": self.state.params["encoder"]}, keep=0)
 
     def finish(self) -> None:
         """Writes the last checkpoint: of parameters alone, and leaves no more of the one before."""
@@ -482,7 +483,7 @@ class Run:
 
         def draw(params: Any, window: Window):
             latents = make_latents(self.agent.encoder, params["encoder"], params["encoder"], window)
-            return {name: image(params["heads"][name], latents, window) for name, image in drawn.items()}
+            return {name: image(params[name], latents, window) for name, image in drawn.items()}
 
         made = jax.device_get(jax.jit(draw)(self.state.params, window))
         stack = self.config.frame_stack
@@ -495,14 +496,21 @@ class Run:
         """Environments with seeds of their own for this purpose."""
         return make_env(self.config, num_envs, seed_for(self.config.seed, purpose, "environments"))
 
-    def initial_encoder(self) -> Any:
-        """Parameters that the encoder starts from, or None for scratch."""
-        if not self.config.encoder_from:
-            return None
-        manifest = checkpoint.read_manifest(self.config.encoder_from)
-        template = jax.eval_shape(self.agent.encoder.init, self.key)
-        tree = checkpoint.load(manifest)["encoder"]
-        return checkpoint.load_into(template, tree, f"--encoder_from={self.config.encoder_from}")
+    def initial_params(self) -> dict[str, Params]:
+        """{group: tree} of what starts from another run: the encoder, and heads as `heads_from` says."""
+        config = self.config
+        if not config.encoder_from:
+            return {}
+        found = checkpoint.load(checkpoint.read_manifest(config.encoder_from))
+        template = self.agent.shapes().params
+        wanted = {"representation": template.keys() - {RL}, "all": template.keys(), "none": {ENCODER}}
+        names = sorted(wanted[config.heads_from] & found.keys())
+        hint = "" if config.heads_from == "none" else " (--heads_from=none starts from the encoder alone)"
+        return checkpoint.load_into(
+            {name: template[name] for name in names},
+            {name: found[name] for name in names},
+            f"--encoder_from={config.encoder_from}{hint}",
+        )
 
     def given_policy(self) -> Policy:
         """The policy of `policy_from`, without noise."""

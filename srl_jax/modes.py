@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from srl_jax.config import Config
 
 
+ENCODER_OPTIMIZERS = ("separate", "summed", "simultaneous")
+"""How two kinds of loss step one encoder: see `srl_jax.update.make_update`."""
+
+
 class Mode(NamedTuple):
     """One training mode.
 
@@ -60,6 +64,18 @@ MODES = {
         ),
     )
 }  # fmt: skip
+
+
+def two_optimizers(config: "Config") -> bool:
+    """Whether the encoder has an Adam of RL's and one of the representation's."""
+    mode = MODES[config.mode]
+    both = mode.rl_trains_encoder and mode.representation_trains_encoder
+    return both and config.encoder_optimizer != "summed"
+
+
+def second_learning_rate(config: "Config") -> float:
+    """`lr_encoder_srl`, or `lr_srl` where that is 0; 0 where the encoder has no second optimizer."""
+    return (config.lr_encoder_srl or config.lr_srl) if two_optimizers(config) else 0.0
 
 
 def encoder_learning_rate(config: "Config") -> float:
@@ -121,6 +137,12 @@ def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", comp
     if config.augment == "srl" and not mode.representation:
         raise ConfigError(
             f"--augment=srl: --mode={mode.name} runs no representation loss; valid here: none, all"
+        )
+    if config.lr_encoder_srl and not two_optimizers(config):
+        raise ConfigError(
+            f"--lr_encoder_srl={config.lr_encoder_srl}: with --mode={mode.name} and "
+            f"--encoder_optimizer={config.encoder_optimizer} the encoder has one optimizer, whose rate is "
+            "--lr_encoder; give 0"
         )
     if config.lr_encoder and mode.encoder_start == "checkpoint" and not mode.rl_trains_encoder:
         raise ConfigError(

@@ -1,5 +1,6 @@
 """Parameter groups and the optimizer: decoder weight decay, clipping, Adam, a learning rate per group."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -9,24 +10,28 @@ import optax
 from srl_jax.types import Array, Objective, Params
 
 RL = "rl"
-"""The name of the RL objective among the objectives, and of its head."""
+"""The name of the RL objective among the objectives, and of its group of parameters."""
+ENCODER = "encoder"
+"""The name of the encoder's group, and of the state of the Adam that steps it."""
+ENCODER_SRL = "encoder_srl"
+"""The name of the state of the encoder's second Adam, the representation's own."""
+NOT_MEASURED = -1.0
+"""In place of a norm in the updates that do not measure it."""
 
 
 class Optimizer(NamedTuple):
-    """Adam over groups of parameters: the encoder and each head, those of them that move.
+    """Adam over groups of parameters, {"encoder": tree, OBJECTIVE: its head's tree}.
 
     Attributes:
-        init: trainable params -> state, {"encoder": Adam's, "heads": {name: Adam's}} with the groups that
-            the params have.
-        update: (grads, state, params, learning_rates, measure) -> (params, state, norms). Grads and params
-            may leave out groups that the state has: those keep their moments and their count of steps.
-            `learning_rates` is {"encoder": [], "rl": [], "representation": []}, traced scalars. Norms are
-            {"encoder": of its gradient, NaN where `measure`, a traced bool, is false; "all": of the whole
-            gradient before clipping, where there is clipping}: each is a pass over the gradient.
+        init: {group: tree} -> {group: Adam's state}.
+        update: (grads, state, params, learning_rates, measure) -> (params, state, norms). All are by group;
+            learning rates are traced scalars. Norms are {"encoder": of its gradient, `NOT_MEASURED` where
+            `measure`, a traced bool, is false; "all": of the whole gradient before clipping, where there is
+            clipping}: each is a pass over the gradient.
     """
 
-    init: object
-    update: object
+    init: Callable
+    update: Callable
 
 
 def make_optimizer(
@@ -36,7 +41,7 @@ def make_optimizer(
     max_grad_norm: float = 0.0,
     adam_eps: float = 1e-8,
 ) -> Optimizer:
-    """The optimizer of the one summed loss.
+    """The optimizer of a weighted sum of losses.
 
     Decoder weight decay is added to the gradient before Adam scales it, as PyTorch's Adam does and hence
     SAC-AE (Yarats et al. 2021) and the thesis; it is not part of any loss.
@@ -47,53 +52,35 @@ def make_optimizer(
         max_grad_norm: the global norm that gradients are clipped to; 0 for no clipping.
         adam_eps: Adam's epsilon.
     """
-
     adam = optax.scale_by_adam(eps=adam_eps)
-
-    def init(params: Params):
-        return _nested({path: adam.init(tree) for path, tree in _groups(params).items()})
+    decays = {name for name, objective in objectives.items() if objective.is_decoder and decoder_weight_decay}
 
     def update(grads, state, params, learning_rates: dict[str, Array], measure: Array | bool = True):
         norms = {}
-        if "encoder" in grads:
-            unknown = lambda _: jnp.float32(jnp.nan)  # noqa: E731
-            norms["encoder"] = jax.lax.cond(measure, optax.tree.norm, unknown, grads["encoder"])
+        if ENCODER in grads:
+            norms[ENCODER] = measured(measure, optax.tree.norm, grads[ENCODER])
         if max_grad_norm:
             norms["all"] = optax.tree.norm(grads)
             factor = jnp.minimum(1.0, max_grad_norm / norms["all"])
             grads = jax.tree.map(lambda g: g * factor, grads)
-        grads, states, trees = _groups(grads), _groups(state), _groups(params)
-        for path, tree in trees.items():
-            rate = learning_rates[_rate_of(path)]
-            if decoder_weight_decay and path[0] == "heads" and objectives[path[1]].is_decoder:
-                grads[path] = jax.tree.map(lambda g, p: g + decoder_weight_decay * p, grads[path], tree)
-            steps, states[path] = adam.update(grads[path], states[path])
-            trees[path] = jax.tree.map(lambda p, u: p - rate * u, tree, steps)  # noqa: B023
-        return _nested(trees), _nested(states), norms
+        moved, new_state = {}, {}
+        for group, tree in params.items():
+            gradient = grads[group]
+            if group in decays:
+                gradient = jax.tree.map(lambda g, p: g + decoder_weight_decay * p, gradient, tree)
+            steps, new_state[group] = adam.update(gradient, state[group])
+            rate = learning_rates[group]
+            moved[group] = jax.tree.map(lambda p, u: p - rate * u, tree, steps)  # noqa: B023
+        return moved, new_state, norms
 
-    return Optimizer(init, update)
+    return Optimizer(lambda params: {group: adam.init(tree) for group, tree in params.items()}, update)
+
+
+def measured(measure: Array | bool, function: Callable, *trees: Params) -> Array:
+    """`function(*trees)`, a float32 scalar, where `measure` is true; else `NOT_MEASURED`."""
+    return jax.lax.cond(measure, function, lambda *_: jnp.float32(NOT_MEASURED), *trees)
 
 
 def real_copy(params: Params) -> Params:
     """New buffers of the same values: two trees that share a buffer cannot both be donated."""
     return jax.tree.map(lambda x: jnp.array(x, copy=True), params)
-
-
-def _groups(params: Params) -> dict[tuple[str, ...], Params]:
-    """{("encoder",): tree, ("heads", NAME): tree} of what {"encoder": tree, "heads": {NAME: tree}} has."""
-    groups = {("heads", name): tree for name, tree in params.get("heads", {}).items()}
-    return {("encoder",): params["encoder"], **groups} if "encoder" in params else groups
-
-
-def _nested(groups: dict[tuple[str, ...], Params]) -> Params:
-    """The inverse of `_groups`."""
-    heads = {path[1]: tree for path, tree in groups.items() if path[0] == "heads"}
-    encoder = {"encoder": groups[("encoder",)]} if ("encoder",) in groups else {}
-    return {**encoder, "heads": heads}
-
-
-def _rate_of(path: tuple[str, ...]) -> str:
-    """The name of a group's learning rate."""
-    if path[0] == "encoder":
-        return "encoder"
-    return RL if path[1] == RL else "representation"

@@ -16,10 +16,14 @@ FOLD_EVERY = 100
 the distance of two rows."""
 
 
+SOMETIMES = ("grad_norm/", "step_ratio/")
+
+
 class Means:
     """The mean of each metric over the updates that measured it, with bounded memory.
 
-    A norm that is NaN was not measured. Sums are float64, in the order of the updates.
+    Metrics whose names begin with one of `SOMETIMES` are negative where they were not measured. Sums are
+    float64, in the order of the updates.
 
     Args:
         fetch: list of updates' metrics, {name: scalar on the device} -> the same on the host.
@@ -39,7 +43,7 @@ class Means:
     def _fold(self) -> None:
         for row in self._fetch(self._waiting):
             for name, x in row.items():
-                if not (name.startswith("grad_norm/") and np.isnan(x)):
+                if not (name.startswith(SOMETIMES) and x < 0):
                     total, count = self._sums.get(name, (0.0, 0))
                     self._sums[name] = total + float(x), count + 1
         self._waiting = []

@@ -117,9 +117,10 @@ class TrainState(NamedTuple):
     """Everything that an update changes.
 
     Attributes:
-        params: {"encoder": tree, "heads": {name: tree}}.
-        slow: the lagged copies, of the same form; real copies, never the same buffers.
-        opt_state: the optimizer's, for the groups that move.
+        params: {"encoder": tree, OBJECTIVE: its head's tree}.
+        slow: {objective: {"encoder": tree, "head": tree}}, the lagged copies of those that have some; real
+            copies, never the same buffers. The encoder is {} where targets are encoded by the online one.
+        opt_state: {group: Adam's state}: "encoder", "encoder_srl" where it has two, and each head that moves.
         step: int32, updates done.
         key: the run's key; update i uses fold_in(key, i), so it never changes.
     """

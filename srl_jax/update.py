@@ -10,13 +10,13 @@ import jax.numpy as jnp
 import optax
 
 from srl_jax.augment import random_shift
-from srl_jax.modes import Mode
-from srl_jax.optim import RL, Optimizer, real_copy
+from srl_jax.modes import ENCODER_OPTIMIZERS, Mode
+from srl_jax.optim import ENCODER, ENCODER_SRL, RL, Optimizer, measured, real_copy
 from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
 from srl_jax.window import observation, stack_last
 
 NORM_EVERY = 10
-"""The norm of the encoder's gradient, a pass over it, is a metric of every so many updates."""
+"""Norms of the encoder's gradients and steps, passes over them, are metrics of every so many updates."""
 
 
 class Hyper(NamedTuple):
@@ -24,7 +24,7 @@ class Hyper(NamedTuple):
 
     Attributes:
         weights: {objective: factor of its mean loss}.
-        learning_rates: {"encoder", "rl", "representation"}.
+        learning_rates: {"encoder", "encoder_srl", "rl", "representation"}.
     """
 
     weights: dict[str, Array]
@@ -71,27 +71,29 @@ def make_init(
     optimizer: Optimizer,
     *,
     target_encoder: str = "slow",
+    encoder_optimizer: str = "separate",
 ) -> Callable:
-    """init: (key, encoder_params | None) -> TrainState.
+    """init: (key, given | None) -> TrainState.
 
-    The encoder has a slow copy where an objective's head has one, unless `target_encoder` is "online".
-    `encoder_params`, where given, is where the encoder starts. Each tree's initial values depend on the key
-    and its own name alone.
+    An objective with a rule has a slow copy of its head and one of the encoder, unless `target_encoder` is
+    "online". `given`, {group: tree}, is where some groups of the parameters start. Each other tree's initial
+    values depend on the key and its own name alone.
     """
 
-    def init(key: Array, encoder_params: Params | None = None) -> TrainState:
+    def init(key: Array, given: Params | None = None) -> TrainState:
         start = named_key(key, "init")
-        if encoder_params is None:
-            encoder_params = encoder.init(named_key(start, "encoder"))
-        heads = {n: o.init(named_key(start, f"head {n}")) for n, o in objectives.items()}
-        params = {"encoder": real_copy(encoder_params), "heads": heads}
-        slow = {"heads": {n: heads[n] for n, o in objectives.items() if o.slow}}
-        slow["encoder"] = params["encoder"] if slow["heads"] and target_encoder == "slow" else {}
-        trainable, _ = split(params, mode, objectives)
+        given = given or {}
+        params = {n: o.init(named_key(start, f"head {n}")) for n, o in objectives.items() if n not in given}
+        if ENCODER not in given:
+            params[ENCODER] = encoder.init(named_key(start, "encoder"))
+        params |= real_copy(given)
+        lagged = params[ENCODER] if target_encoder == "slow" else {}
+        slow = {n: {"encoder": lagged, "head": params[n]} for n, o in objectives.items() if o.slow}
+        groups = [pair for p in passes(mode, objectives, encoder_optimizer) for pair in p.groups.items()]
         return TrainState(
             params=params,
             slow=real_copy(slow),
-            opt_state=optimizer.init(trainable),
+            opt_state=optimizer.init({moments: params[group] for group, moments in groups}),
             step=jnp.zeros((), jnp.int32),
             key=real_copy(key),
         )
@@ -99,51 +101,35 @@ def make_init(
     return init
 
 
-def split(groups: Params, mode: Mode, active: Collection[str]) -> tuple[Params, Params]:
-    """The groups that move where these objectives run in this mode, and those that do not; see `join`.
+class Pass(NamedTuple):
+    """One gradient and one optimizer step of an update.
 
-    Args:
-        groups: {"encoder": tree, "heads": {name: tree}}: parameters, or an optimizer's state.
-    """
-    moves = mode.rl_trains_encoder and RL in active
-    moves |= mode.representation_trains_encoder and any(name != RL for name in active)
-    trainable, still = {"heads": {}}, {"heads": {}}
-    if "encoder" in groups:
-        (trainable if moves else still)["encoder"] = groups["encoder"]
-    for name, head in groups["heads"].items():
-        (trainable if name in active else still)["heads"][name] = head
-    return trainable, still
-
-
-def join(trainable: Params, still: Params) -> Params:
-    """The groups that `split` took apart."""
-    return {**trainable, **still, "heads": {**trainable["heads"], **still["heads"]}}
-
-
-class Moving(NamedTuple):
-    """What an update changes of a `TrainState`: of the groups that move, and the number of updates.
-
-    jax gives the buffers of donated arguments to the results of their shape, in the results' order. With the
-    optimizer's state first, moments are written over the old moments, and not parameters.
+    Attributes:
+        objectives: names of the losses whose weighted sum is differentiated.
+        groups: {group of parameters that moves: group of the optimizer's state that moves it}.
     """
 
-    opt_state: Params
-    params: Params
-    step: Array
+    objectives: tuple[str, ...]
+    groups: dict[str, str]
 
 
-def take_apart(state: TrainState, mode: Mode, active: Collection[str]) -> tuple[Moving, TrainState]:
-    """What an update of these objectives changes of a state, and the rest; see `put_together`."""
-    opt_state, still_opt_state = split(state.opt_state, mode, active)
-    params, still_params = split(state.params, mode, active)
-    still = state._replace(opt_state=still_opt_state, params=still_params, step=None)
-    return Moving(opt_state, params, state.step), still
+def passes(mode: Mode, active: Collection[str], encoder_optimizer: str) -> tuple[Pass, ...]:
+    """The passes of an update that computes these objectives in this mode, in their order.
 
+    One, of the sum of all losses; but where both kinds of loss train the encoder and `encoder_optimizer` is
+    not "summed", RL's and then the representation's, each with an Adam of its own.
+    """
 
-def put_together(moving: Moving, still: TrainState) -> TrainState:
-    """The state that `take_apart` took apart."""
-    opt_state = join(moving.opt_state, still.opt_state)
-    return still._replace(opt_state=opt_state, params=join(moving.params, still.params), step=moving.step)
+    def one(names: tuple[str, ...], moments: str) -> Pass:
+        moves = mode.rl_trains_encoder and RL in names
+        moves |= mode.representation_trains_encoder and any(name != RL for name in names)
+        return Pass(names, {name: name for name in names} | ({ENCODER: moments} if moves else {}))
+
+    both = mode.rl_trains_encoder and mode.representation_trains_encoder and RL in active
+    others = tuple(name for name in active if name != RL)
+    if encoder_optimizer == "summed" or not both or not others:
+        return (one(tuple(active), ENCODER),)
+    return one((RL,), ENCODER), one(others, ENCODER_SRL)
 
 
 def make_update(
@@ -154,15 +140,17 @@ def make_update(
     *,
     augment: str = "none",
     target_encoder: str = "slow",
+    encoder_optimizer: str = "separate",
     only: Collection[str] | None = None,
     slow_follows: bool = True,
 ) -> Callable:
     """update: (TrainState, Window, Hyper) -> (TrainState, td_error [B] | None, metrics), pure; jit it once.
 
-    Sums `weight * mean(losses)` over the objectives, RL among them under the name "rl", takes one gradient
-    and one optimizer step. Objectives share the encoder's forward and backward pass: an offset is encoded
-    at most once for each view. Whether an objective's gradient enters the encoder is the mode's to say, and
-    is decided at the latent, so that nothing is differentiated for nothing.
+    In each of its `passes` it sums `weight * mean(losses)` over the pass' objectives, RL among them under
+    the name "rl", takes one gradient and one optimizer step. Objectives of a pass share the encoder's
+    forward and backward pass: an offset is encoded at most once for each view. Whether an objective's
+    gradient enters the encoder is the mode's to say, and is decided at the latent, so that nothing is
+    differentiated for nothing.
 
     Args:
         encoder: the shared encoder.
@@ -173,6 +161,12 @@ def make_update(
             does.
         target_encoder: "slow": the slow latents come from the encoder's slow copy; "online": from the
             online encoder, as in the thesis' code (without gradient either way).
+        encoder_optimizer: how RL's and the representation's losses, where both train the encoder, step it.
+            "separate": RL's Adam steps, then the representation's own Adam steps on the same batch, encoded
+            anew by the encoder that RL's step left, as in the thesis' code. Adam does not see the scale of
+            a loss, so the two steps are about as long whatever the losses' weights. "simultaneous":
+            likewise, but both gradients are taken at the same parameters. "summed": one Adam on the
+            gradient of the sum.
         only: the objectives that this update computes; None for all. The heads of the others do not move.
         slow_follows: whether the slow copies move by their rules; False leaves that to `make_follow`, which
             then must be called after every `follow_every` updates: an update that never writes to the slow
@@ -180,9 +174,11 @@ def make_update(
 
     Returns:
         The update. Metrics are scalars on the device: `loss/NAME` (before its weight; RL's with its
-        importance weights), `loss/total`, `grad_norm/encoder` (where it moves; NaN but in every
-        `NORM_EVERY`th update), `grad_norm/all` (where gradients are clipped; before that), `NAME/...` of
-        each objective's own.
+        importance weights), `loss/total`, `NAME/...` of each objective's own; `grad_norm/encoder` (where it
+        moves) and `grad_norm/all` (where gradients are clipped; before that), with `_srl` behind them in the
+        second of two passes, and `step_ratio/encoder`, the length of the second pass' step of the encoder
+        over the first's. Those of the encoder are `srl_jax.optim.NOT_MEASURED` but in every `NORM_EVERY`th
+        update.
     """
 
     if augment not in ("none", "srl", "all"):
@@ -190,33 +186,70 @@ def make_update(
     if target_encoder not in ("slow", "online"):
         raise ValueError(f"target_encoder must be slow or online, not {target_encoder}")
 
+    if encoder_optimizer not in ENCODER_OPTIMIZERS:
+        raise ValueError(
+            f"encoder_optimizer must be one of {', '.join(ENCODER_OPTIMIZERS)}, not {encoder_optimizer}"
+        )
+
     active = {n: o for n, o in objectives.items() if only is None or n in only}
-    losses_of = make_losses(encoder, active, mode, augment=augment, target_encoder=target_encoder)
+    steps = []
+    for one in passes(mode, active, encoder_optimizer):
+        own = {name: active[name] for name in one.objectives}
+        losses_of = make_losses(encoder, own, mode, augment=augment, target_encoder=target_encoder)
+        steps.append((one, losses_of))
 
     def update(state: TrainState, window: Window, hyper: Hyper):
         if set(hyper.weights) != set(objectives):
             raise ValueError(f"weights {sorted(hyper.weights)} for losses {sorted(objectives)}")
-        trainable, still = split(state.params, mode, active)
+        measure = state.step % NORM_EVERY == 0
+        params, opt_state = state.params, state.opt_state
+        losses, extra, metrics, lengths = {}, {}, {"loss/total": 0.0}, []
+        for one, losses_of in steps:
+            at = state.params if encoder_optimizer == "simultaneous" else params
 
-        def summed(trainable: Params):
-            losses, metrics = losses_of(join(trainable, still), state, window)
-            total = sum(hyper.weights[name] * jnp.mean(losses[name]) for name in losses)
-            return total, (losses, metrics)
+            def total(moving: Params):
+                losses, extra = losses_of(at | moving, state, window)  # noqa: B023
+                return sum(hyper.weights[name] * jnp.mean(losses[name]) for name in losses), (losses, extra)
 
-        (total, (losses, extra)), grads = jax.value_and_grad(summed, has_aux=True)(trainable)
-        moved, opt_state, norms = optimizer.update(
-            grads, state.opt_state, trainable, hyper.learning_rates, state.step % NORM_EVERY == 0
-        )
-        params = join(moved, still)
+            moving = {group: at[group] for group in one.groups}
+            (value, (own, own_extra)), grads = jax.value_and_grad(total, has_aux=True)(moving)
+            before = {group: params[group] for group in one.groups}
+            moved, moments, norms = optimizer.update(
+                grads,
+                {group: opt_state[name] for group, name in one.groups.items()},
+                before,
+                {group: hyper.learning_rates[rate_of(name)] for group, name in one.groups.items()},
+                measure,
+            )
+            params = params | moved
+            opt_state = opt_state | {one.groups[group]: x for group, x in moments.items()}
+            suffix = "_srl" if lengths else ""
+            metrics |= {f"grad_norm/{group}{suffix}": norm for group, norm in norms.items()}
+            metrics["loss/total"] += value
+            losses, extra = losses | own, extra | own_extra
+            if len(steps) > 1:
+                lengths.append((moved[ENCODER], before[ENCODER]))
+        if lengths:
+            metrics["step_ratio/encoder"] = measured(measure, _length_ratio, *lengths)
         step = state.step + 1
         td_error = extra.get(RL, {}).pop("td_error", None)
-        metrics = {f"loss/{name}": jnp.mean(x) for name, x in losses.items()}
-        metrics |= {"loss/total": total} | {f"grad_norm/{group}": norm for group, norm in norms.items()}
+        metrics |= {f"loss/{name}": jnp.mean(x) for name, x in losses.items()}
         metrics |= {f"{name}/{k}": x for name, values in extra.items() for k, x in values.items()}
         slow = follow(objectives, params, state.slow, step) if slow_follows else state.slow
         return TrainState(params, slow, opt_state, step, state.key), td_error, metrics
 
     return update
+
+
+def rate_of(moments: str) -> str:
+    """The name of the learning rate of a group of the optimizer's state."""
+    return moments if moments in (ENCODER, ENCODER_SRL, RL) else "representation"
+
+
+def _length_ratio(first: tuple[Params, Params], second: tuple[Params, Params]) -> Array:
+    """The length of the second step, (parameters after, before), over the first's."""
+    first, second = (optax.tree.norm(optax.tree.sub(*step)) for step in (first, second))
+    return second / jnp.maximum(first, 1e-30)
 
 
 def make_losses(
@@ -236,17 +269,19 @@ def make_losses(
         key = jax.random.fold_in(state.key, state.step)
         shifted = window if augment == "none" else shift(window, named_key(key, "augment"))
         rl_view = window if augment == "srl" else shifted
-        slow = state.slow["encoder"] if target_encoder == "slow" else params["encoder"]
-        seen = make_latents(encoder, params["encoder"], slow, shifted)
-        rl_seen = seen if rl_view is shifted else make_latents(encoder, params["encoder"], slow, rl_view)
+        seen = encoded(encoder, params["encoder"], shifted)
+        rl_seen = seen if rl_view is shifted else encoded(encoder, params["encoder"], rl_view)
         losses, metrics = {}, {}
         for name, objective in objectives.items():
-            view, latents, opens = shifted, seen, mode.representation_trains_encoder
+            view, online, opens = shifted, seen, mode.representation_trains_encoder
             if name == RL:
-                view, latents, opens = rl_view, rl_seen, mode.rl_trains_encoder
+                view, online, opens = rl_view, rl_seen, mode.rl_trains_encoder
+            own = state.slow.get(name, {"encoder": {}, "head": None})
+            lagged = own["encoder"] if jax.tree.leaves(own["encoder"]) else params["encoder"]
+            latents = Latents(online, frozen(encoded(encoder, lagged, view)))
             losses[name], metrics[name] = objective.loss(
-                params["heads"][name],
-                state.slow["heads"].get(name),
+                params[name],
+                own["head"],
                 latents if opens else shut(latents),
                 view,
                 named_key(key, name),
@@ -297,14 +332,12 @@ def make_conflict(
 
 
 def follow(objectives: dict[str, Objective], params: Params, slow: Params, step: Array) -> Params:
-    """The slow copies after an update, each by its objective's rule; the encoder's goes with RL's."""
-    heads = {
-        name: objectives[name].slow(params["heads"][name], old, step) for name, old in slow["heads"].items()
-    }
-    encoder = slow["encoder"]
-    if RL in objectives and encoder:
-        encoder = objectives[RL].slow(params["encoder"], encoder, step)
-    return {"heads": heads, "encoder": encoder}
+    """The slow copies after an update, {name: {"encoder", "head"}}, each by its objective's rule."""
+    moved = {}
+    for name, old in slow.items():
+        lagged = params["encoder"] if jax.tree.leaves(old["encoder"]) else {}
+        moved[name] = objectives[name].slow({"encoder": lagged, "head": params[name]}, old, step)
+    return moved
 
 
 def shift(window: Window, key: Array) -> Window:
@@ -314,25 +347,31 @@ def shift(window: Window, key: Array) -> Window:
 
 
 def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window) -> Latents:
-    """Latents that encode an offset at most once for each object given as offset."""
+    """Latents of a window under two encoders' parameters; none with gradient under the slow ones."""
+    return Latents(encoded(encoder, params, window), frozen(encoded(encoder, slow, window)))
+
+
+def encoded(encoder: Encoder, params: Params, window: Window) -> Callable:
+    """offset -> latents; encodes an offset at most once for each object given as offset."""
     known = {}
 
-    def at(which: str, tree: Params) -> Callable:
-        def latent(k: int | Array) -> Array:
-            index = (which, k if isinstance(k, int) else id(k))
-            if index not in known:  # the offset is kept too, so that its id stays its own
-                known[index] = (encoder.apply(tree, observation(window, k)), k)
-            return known[index][0]
+    def latent(k: int | Array) -> Array:
+        index = k if isinstance(k, int) else id(k)
+        if index not in known:  # the offset is kept too, so that its id stays its own
+            known[index] = (encoder.apply(params, observation(window, k)), k)
+        return known[index][0]
 
-        return latent
+    return latent
 
-    frozen = at("slow", slow)
-    return Latents(at("online", params), lambda k: jax.lax.stop_gradient(frozen(k)))
+
+def frozen(latent: Callable) -> Callable:
+    """The same latents without gradient."""
+    return lambda k: jax.lax.stop_gradient(latent(k))
 
 
 def shut(latents: Latents) -> Latents:
     """The same latents without gradient: an objective that does not train the encoder."""
-    return Latents(lambda k: jax.lax.stop_gradient(latents.online(k)), latents.slow)
+    return Latents(frozen(latents.online), latents.slow)
 
 
 def make_act(encoder: Encoder, q_values: Callable, *, noisy: bool) -> Callable:

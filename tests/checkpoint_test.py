@@ -30,7 +30,7 @@ CONFIG = Config(game="Catch", frame_size=42, encoder="tiny:features=8", seed=5, 
 def make_params(seed=0):
     rng = np.random.default_rng(seed)
     layer = lambda *shape: {"kernel": rng.normal(size=shape).astype(np.float32)}  # noqa: E731
-    params = {"encoder": {"Conv_0": layer(3, 3, 4, 2)}, "heads": {"rl": {"q": layer(2, 3)}, "latent_l2": {}}}
+    params = {"encoder": {"Conv_0": layer(3, 3, 4, 2)}, "rl": {"q": layer(2, 3)}, "latent_l2": {}}
     # Numbers that a text format, or a change of precision, would not bring back.
     odd = np.array([np.nan, np.inf, -np.inf, -0.0, 1e-45, 3.4e38, 1 / 3], np.float32)
     params["encoder"]["odd"] = {"bias": odd}
@@ -116,7 +116,7 @@ def test_round_trip_is_bit_identical(tmp_path, where):
     assert same_bits(loaded["encoder"]["odd"]["bias"], params["encoder"]["odd"]["bias"])
     del loaded["encoder"]["odd"], params["encoder"]["odd"]  # NaN is not equal to itself
     assert identical(loaded, params)
-    assert loaded["heads"]["latent_l2"] == {}
+    assert loaded["latent_l2"] == {}
 
 
 def test_what_save_returns_is_what_is_read(tmp_path):
@@ -143,7 +143,7 @@ def test_nothing_is_pickled(tmp_path, monkeypatch):
     for name in ("dump", "dumps", "load", "loads", "Pickler", "Unpickler"):
         monkeypatch.setattr(pickle, name, refuse)
     manifest = whole(write(tmp_path, state=make_state()).path)
-    assert identical(checkpoint.load(manifest)["heads"], make_params()["heads"])
+    assert identical(checkpoint.load(manifest)["rl"], make_params()["rl"])
     for name, array in ARRAYS.items():
         assert same_bits(checkpoint.load_array(manifest, name), array)
 
@@ -208,7 +208,7 @@ def test_the_newest_is_read_and_two_are_kept(tmp_path):
     assert checkpoint.read_manifest(tmp_path).env_steps == 300_000
     assert names(tmp_path / "checkpoints") == ["000020000", "000300000"]
     loaded = checkpoint.load(checkpoint.read_manifest(tmp_path))
-    assert identical(loaded["heads"], make_params(300_000)["heads"])
+    assert identical(loaded["rl"], make_params(300_000)["rl"])
     write(tmp_path, env_steps=300_001, keep=1)
     assert names(tmp_path / "checkpoints") == ["000300001"]
 
@@ -235,7 +235,7 @@ def test_a_checkpoint_of_the_same_step_is_replaced(tmp_path):
     write(tmp_path, make_params(1))
     write(tmp_path, make_params(2))
     loaded = checkpoint.load(checkpoint.read_manifest(tmp_path))
-    assert identical(loaded["heads"], make_params(2)["heads"])
+    assert identical(loaded["rl"], make_params(2)["rl"])
 
 
 def test_a_write_that_was_cut_short_is_passed_over_and_cleared(tmp_path):
@@ -253,7 +253,7 @@ def test_slim_leaves_the_parameters(tmp_path):
     slimmed = checkpoint.slim(manifest)
     assert slimmed == whole(manifest.path)
     assert names(manifest.path) == ["manifest.json", "manifest.sha256", "params.msgpack"]
-    assert identical(checkpoint.load(slimmed)["heads"], params["heads"])
+    assert identical(checkpoint.load(slimmed)["rl"], params["rl"])
     assert slimmed._replace(files={}) == manifest._replace(files={})
     with pytest.raises(ConfigError, match="no run.json in this checkpoint"):
         checkpoint.load_numbers(slimmed)
@@ -373,8 +373,8 @@ def test_a_save_that_ends_anywhere_leaves_the_one_before(tmp_path, monkeypatch, 
                 assert "No space left on device" in str(problem) and "\n" not in str(problem)
         reached, faults.left = faults.left <= 0, None
         found, said = newest_good(run)
-        heads = checkpoint.load(found)["heads"]
-        new, old = (identical(heads, make_params(n)["heads"]) for n in (3, 2))
+        heads = checkpoint.load(found)["rl"]
+        new, old = (identical(heads, make_params(n)["rl"]) for n in (3, 2))
         if env_steps == 3000:
             assert not said and (new, old) == ((True, False) if found.env_steps == 3000 else (False, True))
             assert new or ended
@@ -530,7 +530,7 @@ def file(name):
     [
         lambda m: [],
         lambda m: {**m, "format": 1},
-        lambda m: {**m, "format": 3},
+        lambda m: {**m, "format": 4},
         lambda m: {**m, "num_actions": "3"},
         lambda m: {**m, "env_steps": -1},
         lambda m: {**m, "updates": True},
@@ -649,7 +649,7 @@ def test_trees_and_numbers_that_fit_their_sum_but_are_none_are_not_executed(copy
             return trap.touch, ()
 
     trapped = pickle.dumps(Trap())
-    extension = msgpack.packb({"encoder": msgpack.ExtType(1, trapped), "heads": {}})
+    extension = msgpack.packb({"encoder": msgpack.ExtType(1, trapped)})
     for data in (trapped, extension, b"\x01", b"", b"[]", b"\x91" * 100_000, b"[" * 100_000):
         for file, load in (
             ("params.msgpack", checkpoint.load),
@@ -693,7 +693,7 @@ def test_numbers_are_finite(copy, text):
     "leaf", [3, 0.5, "text", None, [0.0], np.float32(1), {5: np.zeros(2, np.float32)}], ids=repr
 )
 def test_only_named_arrays_are_parameters(copy, leaf):
-    tree = {"encoder": {"kernel": leaf}, "heads": {}}
+    tree = {"encoder": {"kernel": leaf}}
     replace(copy, "params.msgpack", serialization.msgpack_serialize(tree))
     with pytest.raises(ConfigError, match="params.msgpack"):
         checkpoint.load(whole(copy))
@@ -707,13 +707,13 @@ def test_a_name_that_no_file_can_have_is_refused():
 def test_parameters_of_another_form_are_refused_by_name():
     template, cases = make_params(), []
     shape, dtype, missing, extra = (make_params() for _ in range(4))
-    shape["heads"]["rl"]["q"]["kernel"] = np.zeros((3, 2), np.float32)
+    shape["rl"]["q"]["kernel"] = np.zeros((3, 2), np.float32)
     cases.append((shape, r"\(3, 2\), not float32 \(2, 3\)"))
-    dtype["heads"]["rl"]["q"]["kernel"] = np.zeros((2, 3), np.float64)
+    dtype["rl"]["q"]["kernel"] = np.zeros((2, 3), np.float64)
     cases.append((dtype, "float64"))
-    del missing["heads"]["rl"]["q"]
+    del missing["rl"]["q"]
     cases.append((missing, "on one side only"))
-    extra["heads"]["inverse"] = {"kernel": np.zeros(1, np.float32)}
+    extra["inverse"] = {"kernel": np.zeros(1, np.float32)}
     cases.append((extra, "'inverse'.*on one side only"))
     for tree, message in cases:
         with pytest.raises(ConfigError, match="the source: parameter.*" + message):
@@ -723,8 +723,8 @@ def test_parameters_of_another_form_are_refused_by_name():
 @pytest.mark.parametrize("branch", [{}, []], ids=["branch", "list"])
 def test_parameters_with_an_empty_branch_more_or_less_are_refused(branch):
     template, extra, less = make_params(), make_params(), make_params()
-    extra["heads"]["inverse"] = branch
-    del less["heads"]["latent_l2"]
+    extra["inverse"] = branch
+    del less["latent_l2"]
     for tree in (extra, less):
         with pytest.raises(ConfigError, match="the source: parameters do not fit"):
             checkpoint.load_into(template, tree, "the source")

@@ -181,9 +181,9 @@ def test_gradient_conflict_of_losses_whose_gradients_are_known():
     terms = {RL: objective(2.0), "same": objective(1.0), "against": objective(-6.0)}
     params = {
         "encoder": random_params(context.encoder.init),
-        "heads": {name: {"w": np.float32(1)} for name in terms},
+        **{name: {"w": np.float32(1)} for name in terms},
     }
-    slow = {"heads": {}, "encoder": params["encoder"]}
+    slow = {}
     state = TrainState(params, slow, None, np.int32(0), jax.random.key(0))
     hyper = Hyper({RL: np.float32(1), "same": np.float32(4), "against": np.float32(1)}, {})
     # In mode decoupled RL's gradient does not enter the encoder; this is the one that it would be.
@@ -253,7 +253,7 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     lines = []
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
     functions = SimpleNamespace(encode=encode, decode={}, others=(), conflict=None, lock=threading.Lock())
-    params = {"encoder": {"w": np.float32(0.5)}, "heads": {}}
+    params = {"encoder": {"w": np.float32(0.5)}}
     state = TrainState(params, {}, None, np.int32(0), None)
 
     def make():
@@ -368,7 +368,7 @@ def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
     diagnostics = Diagnostics(config, functions, 1, tmp_path, lines.append)
 
     def measure(step):
-        params = {"encoder": {"w": np.float32(0.5)}, "heads": {"x": {"w": np.float32(step)}}}
+        params = {"encoder": {"w": np.float32(0.5)}, "x": {"w": np.float32(step)}}
         values = diagnostics.measure(TrainState(params, {}, None, np.int32(0), None), step, None, None)
         arguments = {"num_actions": 3, "env_steps": step, "updates": 0, "keep": 0, "folder": "encoders"}
         checkpoint.save(tmp_path, diagnostics.parts(params), config, **arguments)

@@ -15,7 +15,7 @@ from srl_jax.errors import ConfigError, SaveError
 from tests.rundir_test import contents
 
 CONFIG = Config(game="Catch", frame_size=42, steps=500, checkpoint_every=100, num_envs=4)
-PARAMS = {"encoder": {"kernel": np.ones((2, 2), np.float32)}, "heads": {}}
+PARAMS = {"encoder": {"kernel": np.ones((2, 2), np.float32)}}
 GOING_ON = checkpoint.State({}, {"x": np.arange(3)}, {"y": 1})
 
 

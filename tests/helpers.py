@@ -112,8 +112,11 @@ def random_state(init, seed: int = 0) -> TrainState:
     return TrainState(
         params=params,
         slow={
-            "heads": {name: to_numpy(params["heads"][name]) for name in shapes.slow["heads"]},
-            "encoder": to_numpy(params["encoder"]) if shapes.slow["encoder"] else {},
+            name: {
+                "encoder": to_numpy(params["encoder"]) if own["encoder"] else {},
+                "head": to_numpy(params[name]),
+            }
+            for name, own in shapes.slow.items()
         },
         opt_state=jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes.opt_state),
         step=np.int32(0),

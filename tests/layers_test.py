@@ -210,7 +210,7 @@ def test_a_convolution_starts_as_asked():
     def start(**options):
         return jit(Conv(64, 5, 1, **options).init)(jax.random.key(0), jnp.zeros((1, 5, 5, 4)))["params"]
 
-    # PyTorch's default, kaiming_uniform with a = sqrt(5): U(-1/sqrt(fan_in), 1/sqrt(fan_in)), 5 * 5 * 4 = 100.
+    # PyTorch's default, U(-1/sqrt(fan_in), 1/sqrt(fan_in)), with 5 * 5 * 4 = 100 inputs.
     textbook, he, centred = start(), start(init="he"), start(zero_sum=True)
     for leaf in (textbook["kernel"], textbook["bias"]):
         assert 0.09 < np.abs(leaf).max() <= 0.1

@@ -180,7 +180,7 @@ def test_an_agent_comes_back_from_its_checkpoint(joint):
     path, _ = joint
     agent, params, manifest = loop.load_agent(path)
     assert (manifest.env_steps, manifest.updates) == (240, 25)
-    assert set(params["heads"]) == {"rl", "reconstruction", "latent_l2"}
+    assert set(params) == {"encoder", "rl", "reconstruction", "latent_l2"}
     assert set(agent.objectives) == {"rl", "reconstruction", "latent_l2"}
 
 

@@ -133,12 +133,13 @@ def build(kind: str, name: str) -> Row:
     optimizer = make_optimizer(terms, adam_eps=1e-4)
     init = make_init(encoder, terms, MODES["joint"], optimizer)
     state = helpers.random_state(init)
-    if state.slow["heads"]:  # as it is between two copies: not the online one
+    if state.slow:  # as it is between two copies: not the online one
         state = state._replace(slow=helpers.random_state(init, 1).slow)
 
     def loss(params, slow, window, key, gate=lambda latents: latents):
-        latents = gate(make_latents(encoder, params["encoder"], slow["encoder"], window))
-        losses, metrics = objective.loss(params["heads"][name], slow["heads"].get(name), latents, window, key)
+        own = slow.get(name, {"encoder": {}, "head": None})
+        latents = gate(make_latents(encoder, params["encoder"], own["encoder"], window))
+        losses, metrics = objective.loss(params[name], own["head"], latents, window, key)
         return jnp.mean(losses), (losses, metrics)
 
     def probe(state, window, key):
@@ -149,8 +150,8 @@ def build(kind: str, name: str) -> Row:
         return gradient["encoder"]
 
     def picture(state, window):
-        latents = make_latents(encoder, state.params["encoder"], state.slow["encoder"], window)
-        return objective.image(state.params["heads"][name], latents, window)
+        latents = make_latents(encoder, state.params["encoder"], {}, window)
+        return objective.image(state.params[name], latents, window)
 
     update = make_update(encoder, terms, MODES["joint"], optimizer)
     return Row(
@@ -200,7 +201,7 @@ def test_gradients_reach_the_head_and_the_encoder_and_no_slow_copy(kind, name):
     assert helpers.zero_leaves(gradient) == []
     assert helpers.all_zero(slow)
     if kind == "rl":
-        assert slow["encoder"] and slow["heads"][row.name]  # there was something to reach
+        assert slow[row.name]["encoder"] and slow[row.name]["head"]  # there was something to reach
     assert helpers.all_zero(row.shut_gradient(row.state, row.window, row.key))
 
 

@@ -50,14 +50,14 @@ PIXELS = Encoder(  # its latent is the observation itself, times a number
     make_decoder=None,
 )
 SMALL = make_window()
-RATES = dict.fromkeys(("encoder", RL, "representation"), np.float32(0.1))
+RATES = dict.fromkeys(("encoder", "encoder_srl", RL, "representation"), np.float32(0.1))
 
 
 def make_peeks(*names, mode="joint", every=2, clip=0.0, **options):
     """(init, update, hyper) of peeks by name; RL's has a slow copy."""
     terms = {name: make_peek(slow=periodic(every) if name == RL else None) for name in names}
     optimizer = make_optimizer(terms, max_grad_norm=clip)
-    starts = {n: v for n, v in options.items() if n == "target_encoder"}
+    starts = {n: v for n, v in options.items() if n in ("target_encoder", "encoder_optimizer")}
     init = make_init(PIXELS, terms, MODES[mode], optimizer, **starts)
     update = make_update(PIXELS, terms, MODES[mode], optimizer, **options)
     return init, update, Hyper(dict.fromkeys(names, np.float32(1)), RATES)
@@ -72,7 +72,7 @@ def test_each_augmentation_and_who_sees_it():
     assert not any(np.array_equal(*pair) for pair in zip(shifted, SMALL.frames, strict=True))
     views = {"none": (SMALL.frames, SMALL.frames), "srl": (SMALL.frames, shifted), "all": (shifted, shifted)}
     for augment, (rl_view, representation_view) in views.items():
-        init, update, hyper = make_peeks(RL, "peek", augment=augment)
+        init, update, hyper = make_peeks(RL, "peek", augment=augment, encoder_optimizer="summed")
         _, _, metrics = jit(update)(init(key), SMALL, hyper)
         for name, view in ((RL, rl_view), ("peek", representation_view)):
             np.testing.assert_array_equal(metrics[f"{name}/frames"], view, err_msg=f"{augment} {name}")
@@ -95,11 +95,11 @@ def test_another_objective_changes_no_ones_noise_or_start():
     key = jax.random.key(1)
     alone, together = make_peeks(RL), make_peeks("first", RL, "peek")
     states = [init(key) for init, _, _ in (alone, together)]
-    for tree in ("params", "slow"):
-        ours, theirs = (getattr(state, tree) for state in states)
-        assert identical(ours["encoder"], theirs["encoder"])
-        assert identical(ours["heads"][RL], theirs["heads"][RL])
-    heads = states[1].params["heads"]
+    ours, theirs = (state.params for state in states)
+    assert identical(ours["encoder"], theirs["encoder"])
+    assert identical(ours[RL], theirs[RL])
+    assert identical(states[0].slow[RL], states[1].slow[RL])
+    heads = states[1].params
     assert not np.array_equal(heads["first"]["w"], heads["peek"]["w"])
 
     ours, theirs = (
@@ -126,21 +126,23 @@ def test_noise_differs_between_updates_and_seeds():
 def test_an_update_of_some_objectives_leaves_the_others_alone():
     terms = {name: make_peek(slow=periodic(2) if name == RL else None) for name in (RL, "peek")}
     optimizer = make_optimizer(terms)
-    init = make_init(PIXELS, terms, MODES["joint"], optimizer)
+    how = {"encoder_optimizer": "summed"}
+    init = make_init(PIXELS, terms, MODES["joint"], optimizer, **how)
     hyper = Hyper(dict.fromkeys(terms, np.float32(1)), RATES)
     update = {
-        only: jit(make_update(PIXELS, terms, MODES["joint"], optimizer, only=only)) for only in (None, (RL,))
+        only: jit(make_update(PIXELS, terms, MODES["joint"], optimizer, only=only, **how))
+        for only in (None, (RL,))
     }
     start = init(jax.random.key(0))
     one, td_error, metrics = update[(RL,)](start, SMALL, hyper)
     assert "loss/peek" not in metrics and f"loss/{RL}" in metrics
-    assert identical(one.params["heads"]["peek"], start.params["heads"]["peek"])
-    assert identical(one.opt_state["heads"]["peek"], start.opt_state["heads"]["peek"])
-    for tree in (lambda s: s.params["heads"][RL], lambda s: s.params["encoder"]):
+    assert identical(one.params["peek"], start.params["peek"])
+    assert identical(one.opt_state["peek"], start.opt_state["peek"])
+    for tree in (lambda s: s.params[RL], lambda s: s.params["encoder"]):
         assert all_moved(tree(one), tree(start))
     # RL sees the same noise and moves its head alike, whether others are computed or not.
     both, _, _ = update[None](start, SMALL, hyper)
-    np.testing.assert_allclose(one.params["heads"][RL]["w"], both.params["heads"][RL]["w"], rtol=1e-6)
+    np.testing.assert_allclose(one.params[RL]["w"], both.params[RL]["w"], rtol=1e-6)
     assert not identical(one.opt_state["encoder"], both.opt_state["encoder"])
     # In decoupled, the encoder is trained by what is left out, and so rests; Adam counts no step for it.
     rests = jit(make_update(PIXELS, terms, MODES["decoupled"], optimizer, only=(RL,)))
@@ -180,7 +182,7 @@ def test_slow_copies_may_follow_apart_from_the_update():
 def test_target_encoder(target_encoder):
     init, update, hyper = make_peeks(RL, every=3, target_encoder=target_encoder)
     update, state = jit(update), init(jax.random.key(0))
-    assert (state.slow["encoder"] == {}) == (target_encoder == "online")
+    assert (state.slow[RL]["encoder"] == {}) == (target_encoder == "online")
     start = state.params["encoder"]["scale"]
     pixels = observation(SMALL, 0).reshape(len(SMALL.frames), -1) / 255
     for i in range(4):
@@ -205,7 +207,7 @@ def test_no_gradient_through_the_target_encoder():
         update = make_update(PIXELS, terms, MODES["joint"], optimizer, **options)
         after, _, _ = jit(update)(state, SMALL, Hyper({RL: 1.0}, RATES))
         assert identical(state.params["encoder"], after.params["encoder"])
-        assert not identical(state.params["heads"], after.params["heads"])
+        assert not identical(state.params[RL], after.params[RL])
 
 
 def test_an_objective_may_have_a_slow_copy_of_its_own_rule():
@@ -215,10 +217,10 @@ def test_an_objective_may_have_a_slow_copy_of_its_own_rule():
     before = make_init(PIXELS, terms, MODES["joint"], optimizer)(jax.random.key(0))
     update = make_update(PIXELS, terms, MODES["joint"], optimizer)
     after, _, _ = jit(update)(before, SMALL, Hyper({RL: 1.0, "peek": 1.0}, RATES))
-    expected = 0.5 * after.params["heads"]["peek"]["w"] + 0.5 * before.slow["heads"]["peek"]["w"]
-    np.testing.assert_allclose(after.slow["heads"]["peek"]["w"], expected, rtol=1e-6)
-    assert identical(after.slow["heads"][RL], before.slow["heads"][RL])
-    assert identical(after.slow["encoder"], before.slow["encoder"])  # goes with RL's
+    expected = 0.5 * after.params["peek"]["w"] + 0.5 * before.slow["peek"]["head"]["w"]
+    np.testing.assert_allclose(after.slow["peek"]["head"]["w"], expected, rtol=1e-6)
+    assert identical(after.slow[RL], before.slow[RL])
+    assert not identical(after.slow["peek"]["encoder"], before.slow["peek"]["encoder"])
 
 
 def test_numbers_may_change_without_another_trace():
@@ -264,10 +266,10 @@ def test_state_can_be_donated_and_its_key_and_encoder_stay_the_callers():
 
 def test_an_encoder_that_is_given_is_where_it_starts():
     init, _, _ = make_peeks(RL, mode="frozen")
-    state = init(jax.random.key(0), {"scale": np.full(1, 7.0, np.float32)})
-    assert state.params["encoder"]["scale"] == state.slow["encoder"]["scale"] == 7
+    state = init(jax.random.key(0), {"encoder": {"scale": np.full(1, 7.0, np.float32)}})
+    assert state.params["encoder"]["scale"] == state.slow[RL]["encoder"]["scale"] == 7
     # The heads start as without it.
-    assert identical(state.params["heads"], init(jax.random.key(0)).params["heads"])
+    assert identical(state.params[RL], init(jax.random.key(0)).params[RL])
 
 
 def test_seeds_may_be_vmapped_from_the_start():
@@ -304,7 +306,7 @@ def test_a_gate_that_is_shut_costs_no_differentiation():
     state = init(jax.random.key(0))
     after, _, metrics = jit(update)(state, SMALL, hyper)
     assert identical(after.params["encoder"], state.params["encoder"])
-    gradient = 2 * np.asarray(state.params["heads"][RL]["w"])  # of the head's sum of squares
+    gradient = 2 * np.asarray(state.params[RL]["w"])  # of the head's sum of squares
     np.testing.assert_allclose(metrics["grad_norm/all"], np.linalg.norm(gradient), rtol=1e-5)
     assert "grad_norm/encoder" not in metrics
 

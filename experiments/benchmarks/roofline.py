@@ -39,8 +39,7 @@ def update_cost(preset: str) -> Cost:
     agent = make_agent(config, NUM_ACTIONS)
     state = jax.eval_shape(agent.init, jax.random.key(0))
     window = random_window(config, agent.horizon, 0)
-    arguments = agent.update.arguments(state, window, agent.hyper)
-    operations = agent.update.compiled.lower(*arguments).cost_analysis()["flops"]
+    operations = jax.jit(agent.update.pure).lower(state, window, agent.hyper).cost_analysis()["flops"]
     trained, slow = (4 * sum(x.size for x in jax.tree.leaves(tree)) for tree in (state.params, state.slow))
     return Cost(float(operations), float(PASSES * trained + slow))
 

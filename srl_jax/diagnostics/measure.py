@@ -94,10 +94,7 @@ class Diagnostics:
 
     def parts(self, params: Params) -> Params:
         """Of the parameters those that are kept: the encoder, and heads that make images."""
-        return {
-            "encoder": params["encoder"],
-            "heads": {name: params["heads"][name] for name in sorted(self._functions.decode)},
-        }
+        return {name: params[name] for name in ("encoder", *sorted(self._functions.decode))}
 
     def _measure(self, state: TrainState, env_steps: int, window: Window | None, hyper: Hyper):
         held_out, params = self._held_out, self.parts(state.params)
@@ -116,7 +113,7 @@ class Diagnostics:
         }
         if self._config.frame_stack > 1:
             values["moving_share"] = measures.moving_share(held_out.observations)
-        if params["heads"]:
+        if len(params) > 1:
             values |= self._decoded(params, now, kept)
         if window is not None and self._functions.conflict is not None:
             found = jax.device_get(self._functions.conflict(state._replace(opt_state=None), window, hyper))
@@ -140,7 +137,8 @@ class Diagnostics:
             return float(np.concatenate([e for e, _, _ in self._decode(name, head, latents, CROSSED)]).mean())
 
         values: dict[str, Any] = {}
-        for name, head in params["heads"].items():
+        heads = {name: tree for name, tree in params.items() if name != "encoder"}
+        for name, head in heads.items():
             errors, targets, outputs = (
                 np.concatenate(x) for x in zip(*self._decode(name, head, now.latents, DECODED), strict=True)
             )
@@ -153,8 +151,8 @@ class Diagnostics:
                 values |= {f"error/{name}/{what}": value for what, value in found.items()}
         for step in kept:
             then = self._read(step, params)
-            for name in params["heads"]:
-                error = crossed(name, then["heads"][name], now.latents) if then else math.nan
+            for name in heads:
+                error = crossed(name, then[name], now.latents) if then else math.nan
                 values[f"encoder_now/{name}"].append(error)
         return values
 

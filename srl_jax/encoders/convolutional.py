@@ -13,6 +13,7 @@ from srl_jax.types import Array, Decoder, Encoder
 LEAST_SEEN = 0.95
 """The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
 
+
 class Layer(NamedTuple):
     """One convolution: output channels, side of the kernel and stride, both in pixels."""
 

@@ -48,8 +48,10 @@ while any(p.poll() is None for p in processes.values()):
     time.sleep(2)
     for arm, process in processes.items():
         seen = [max(points, default=0) for points in returns(arm).values()]
-        if process.poll() is None and arm not in stopped and (
-            (seen and min(seen) >= steps) or time.time() - began > seconds
+        if (
+            process.poll() is None
+            and arm not in stopped
+            and ((seen and min(seen) >= steps) or time.time() - began > seconds)
         ):
             process.send_signal(signal.SIGTERM)
             stopped.add(arm)
