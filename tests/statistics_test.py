@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import warnings
+from fractions import Fraction
 from functools import partial
 
 import numpy as np
@@ -211,6 +212,20 @@ def test_the_interval_of_ten_normal_runs_covers_less_than_it_says_but_not_by_muc
     found = [bootstrap(mean, rng.normal(size=(10, 1)), repetitions=400, seed=i) for i in range(400)]
     covered = np.mean([interval.low <= 0 <= interval.high for interval in found])
     assert 0.85 < covered < 0.97
+
+
+def test_the_interquartile_mean_of_many_different_numbers_of_runs():
+    # The least common multiple of these is 3e18 and more than an int64 holds, so by exact fractions:
+    scores = {str(n): np.arange(n) % 50 + n / 1000 for n in (101, 103, 107, 109, 113, 127, 131, 137, 139)}
+    weighed = sorted((x, Fraction(1, len(game))) for game in scores.values() for x in game)
+    cut, total, upto = Fraction(len(scores), 4), Fraction(0), Fraction(0)
+    for x, weight in weighed:
+        kept = max(0, min(upto + weight, len(scores) - cut) - max(upto, cut))
+        total, upto = total + kept * Fraction(x), upto + weight
+    assert interquartile_mean(scores) == pytest.approx(float(total / (len(scores) - 2 * cut)), rel=1e-12)
+    assert interquartile_mean({str(n): np.full(n, 2.5) for n in range(3, 44)}) == pytest.approx(
+        2.5, rel=1e-12
+    )
 
 
 def test_a_single_run_has_no_interval():
