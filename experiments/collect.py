@@ -66,9 +66,7 @@ def load_runs(root: str | Path) -> list[RunData]:
         ConfigError: there is none, one cannot be read, or two are of the same game, arm and seed.
     """
     root = Path(root)
-    found = [path.parent for path in [root / "config.json", *sorted(root.rglob("config.json"))]]
-    inside = {path: path.relative_to(root).parts for path in found if path.joinpath("config.json").is_file()}
-    paths = [path for path, parts in inside.items() if not any(".broken-" in part for part in parts)]
+    paths = _directories(root)
     if not paths:
         raise ConfigError(f"{root}: no run directory there (none has a config.json)")
     runs: dict[tuple, RunData] = {}
@@ -78,6 +76,17 @@ def load_runs(root: str | Path) -> list[RunData]:
         if other is not run:
             raise ConfigError(f"{path}: the same game, arm and seed as {other.path}; move one of them away")
     return [runs[key] for key in sorted(runs)]
+
+
+def arm_names(root: Path) -> list[str]:
+    """The arms of all runs in or below a directory, which are not read."""
+    return sorted({arm_name(path) for path in _directories(root)})
+
+
+def _directories(root: Path) -> list[Path]:
+    found = [path.parent for path in [root / "config.json", *sorted(root.rglob("config.json"))]]
+    inside = {path: path.relative_to(root).parts for path in found if path.joinpath("config.json").is_file()}
+    return [path for path, parts in inside.items() if not any(".broken-" in part for part in parts)]
 
 
 def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:

@@ -2,13 +2,14 @@
 
 import os
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from experiments import plots
+from experiments.colours import Style, styles
 
 
 class Line(NamedTuple):
@@ -54,7 +55,13 @@ class Panel(NamedTuple):
     levels: Sequence[Level] = ()
 
 
-def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, note: str = "") -> Path:
+def comparison(
+    panels: Sequence[Panel],
+    path: str | os.PathLike,
+    title: str,
+    note: str = "",
+    looks: Mapping[str, Style] | None = None,
+) -> Path:
     """Draws a panel a game; bands are intervals over seeds.
 
     The thesis' curves are dashed, in their arm's colour, and end where the panel's longest line does.
@@ -64,11 +71,12 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
         path: of the PNG file.
         title: of the figure.
         note: below it.
+        looks: label -> colour and line; None for those that the labels have by themselves.
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
     labels = list(dict.fromkeys(line.label for panel in panels for line in panel.lines))
-    colours = {label: plots.COLOURS[i % len(plots.COLOURS)] for i, label in enumerate(labels)}
+    looks = looks or styles(labels)
     width = 4.6 if columns > 1 else 6.4
     figure = plots.new_figure(width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)
     handles: dict[str, object] = {}
@@ -79,9 +87,9 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
         for line in panel.lines:
             if not len(line.steps):
                 continue
-            colour = colours[line.label]
+            colour, pattern = looks[line.label]
             axes.fill_between(line.steps, line.low, line.high, color=colour, alpha=0.18, linewidth=0)
-            (handle,) = axes.plot(line.steps, line.mean, color=colour, linewidth=1.8)
+            (handle,) = axes.plot(line.steps, line.mean, pattern, color=colour, linewidth=1.8)
             handles.setdefault(f"{line.label} ({_seeds(panels, line.label)})", handle)
             if line.thesis is not None:
                 steps, returns = (np.asarray(x, float) for x in line.thesis)
@@ -93,6 +101,10 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
         _levels(axes, panel.levels, end)
         plots.count_axis(axes)
         axes.set_xlim(0, end)
+        if axes.lines:
+            shown = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
+            bands = np.concatenate([limit for line in panel.lines for limit in (line.low, line.high)])
+            axes.set_ylim(*plots.heights(shown, bands))
     known = "the thesis' own, one run each"
     if known in handles:  # last, and in no arm's colour
         from matplotlib.lines import Line2D

@@ -3,14 +3,14 @@
     python -m experiments.figures --figure=6.3 --games=Pong,Breakout --seeds=3 --steps=500000
 
 Every arm of the figure that has not been run yet is run, each seed as a process of its own that can be killed
-and gone on with; then the figure is drawn: mean evaluation return over seeds with 95 % intervals of the
-stratified bootstrap, against env steps, over the thesis' own curve where there is one. FIGURE.png and
+and gone on with; then the figure is drawn: mean evaluation return over seeds with 95 % t intervals at each
+point, against env steps, over the thesis' own curve where there is one. FIGURE.png and
 FIGURE.json (its numbers) go to OUT/figures. Runs lie in OUT/GAME/ARM/seedN and are shared by all figures.
 Every flag of experiments.train that says something of a run goes to all of them.
 """
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,7 @@ from experiments import collect, curves, plots, sweep
 from experiments import flags as config_flags
 from experiments.arms import FIGURES, Figure, figures_named
 from experiments.collect import RunData, comparable, steps_and_returns
+from experiments.colours import styles
 from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
 from srl_jax import statistics
 from srl_jax.config import Config
@@ -61,8 +62,12 @@ def evaluated(
     *,
     methods: Sequence[str] = (),
     force: bool = False,
+    among: Iterable[str] = (),
 ) -> dict[str, Any]:
     """The numbers of a figure, as JSON values; what has no interval (a single seed) has None there.
+
+    Beside the limits of an interval stands its kind, see `srl_jax.statistics.Interval`; a difference of means
+    has the p value of Welch's test.
 
     Args:
         figure: its first arm is the baseline.
@@ -70,6 +75,7 @@ def evaluated(
         games: in this order.
         methods: whose published scores are given, with what differs.
         force: compare runs of different protocols, and say what differs.
+        among: all arms of the directory, beside which an arm has the same colour in all figures.
 
     Raises:
         ConfigError: runs cannot be compared.
@@ -85,6 +91,7 @@ def evaluated(
         "question": figure.question,
         "baseline": names[0],
         "arms": names,
+        "styles": {name: list(style) for name, style in styles(names, among).items()},
         "level": 0.95,
         "forced": forced,
         "games": {},
@@ -100,7 +107,7 @@ def evaluated(
         for name, arm in found.items():
             values = {"seeds": [run.seed for run in members[name]]} | _curve(arm)
             values |= {
-                of: _limits(statistics.bootstrap(statistics.mean, {game: x})) for of, x in ends[name].items()
+                of: _limits(statistics.estimate(statistics.mean, {game: x})) for of, x in ends[name].items()
             }
             if name != names[0] and names[0] in found:
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
@@ -129,10 +136,13 @@ def _ends(arm: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str,
 
 def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """An arm's `_ends` against the baseline's."""
-    found = {of: statistics.bootstrap_difference({game: ours[of]}, {game: base[of]}) for of in ours}
+    found = {}
+    for of in ours:
+        difference = statistics.estimate_difference({game: ours[of]}, {game: base[of]})
+        found[of] = _limits(difference) | {"p": _plain(statistics.welch_p(ours[of], base[of]))}
     areas = ({game: x["area_under_curve"]} for x in (ours, base))
-    found["probability_of_improvement"] = statistics.bootstrap(statistics.probability_of_improvement, *areas)
-    return {name: _limits(interval) for name, interval in found.items()}
+    better = statistics.estimate(statistics.probability_of_improvement, *areas)
+    return found | {"probability_of_improvement": _limits(better)}
 
 
 def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[curves.Level]:
@@ -170,17 +180,18 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
                 seeds, thesis = len(values["seeds"]), arm.thesis_curve(game)
                 lines.append(curves.Line(arm.name, values["env_steps"], *limits, seeds, thesis))
         panels.append(curves.Panel(game, lines, [curves.Level(**level) for level in entry["published"]]))
-    note = "bands: 95 % stratified bootstrap over seeds"
+    kinds = {arm["kind"] for entry in numbers["games"].values() for arm in entry["arms"].values()}
+    kinds = ", ".join(sorted(kinds - {statistics.NONE}))
+    note = f"bands: 95 % intervals over seeds at each point, {kinds}" if kinds else "single seeds: no bands"
     if numbers["forced"]:
         note += "; PROTOCOLS DIFFER between runs"
-    return curves.comparison(panels, path, f"{figure.name}  {figure.title}", note)
+    looks = {arm: tuple(style) for arm, style in numbers["styles"].items()}
+    return curves.comparison(panels, path, f"{figure.name}  {figure.title}", note, looks)
 
 
 def _limits(interval: statistics.Interval) -> dict[str, Any]:
-    return {
-        name: _plain(getattr(interval, key))
-        for name, key in (("mean", "point"), ("low", "low"), ("high", "high"))
-    }
+    point, low, high = (_plain(values) for values in interval[:3])
+    return {"mean": point, "low": low, "high": high, "kind": interval.kind}
 
 
 def _plain(values: Any) -> Any:
@@ -253,8 +264,8 @@ def run(values: flags.FlagValues) -> int:
                 return status
         here = [root / run.name for run in runs if (root / run.name / "config.json").exists()]
         read = [collect.load_run(path) for path in here]
+        how = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
         for figure in figures:
-            how = {"methods": methods, "force": values["force"].value}
             print(write(figure, read, games, root / "figures", **how))
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error

@@ -234,6 +234,24 @@ def new_figure(width: float, height: float):
     return figure
 
 
+def heights(lines: Any, bands: Any = ()) -> tuple[float, float]:
+    """Limits of a vertical axis that show all of the lines, and of bands what does not make the lines flat.
+
+    The t interval of two runs is nine standard deviations wide to either side; what is further from the lines
+    than they are high, all together, is cut off.
+
+    Args:
+        lines: values [N], some of them finite.
+        bands: limits of intervals [M]; those that are not finite do not count.
+    """
+    lines, bands = (np.asarray(values, float) for values in (lines, bands))
+    low, high = np.nanmin(lines), np.nanmax(lines)
+    room = high - low or 0.5
+    shown = np.clip(np.append(bands[np.isfinite(bands)], [low, high]), low - room, high + room)
+    edge = 0.05 * np.ptp(shown) or room
+    return float(shown.min() - edge), float(shown.max() + edge)
+
+
 def count_axis(axes) -> None:
     """Env steps as 200k or 1.5M, a light grid, no box."""
     from matplotlib.ticker import EngFormatter, MaxNLocator

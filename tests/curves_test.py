@@ -55,6 +55,21 @@ def test_a_band_is_the_interval(drawn, tmp_path):
     assert (corners[:, 0].min(), corners[:, 0].max()) == (0, 200)
 
 
+def test_a_band_that_is_very_wide_does_not_make_the_lines_flat(drawn, tmp_path):
+    wide = curves.Line("a", STEPS, [0.0, 1.0, 2.0], [np.nan, -8.0, -7.0], [np.nan, 2.5, 11.0], 2)
+    curves.comparison([curves.Panel("Pong", [wide])], tmp_path / "x.png", "title")
+    # The line is 2 high, so that the axis ends 2 beyond it, and 5 % of these six.
+    assert drawn[0].axes[0].get_ylim() == pytest.approx((-2.3, 4.3))
+
+
+def test_arms_look_as_they_are_told_to(drawn, tmp_path):
+    looks = {"a": ("#112233", "-"), "b": ("#112233", ":")}
+    panel = _panel("Pong", a=(1.0, None), b=(2.0, None))
+    curves.comparison([panel], tmp_path / "x.png", "title", looks=looks)
+    drawn = [line for line in drawn[0].axes[0].lines if len(line.get_xdata()) == 3]
+    assert [(line.get_color(), line.get_linestyle()) for line in drawn] == list(looks.values())
+
+
 def test_the_same_numbers_give_the_same_file(tmp_path):
     panels = [_panel("Pong", a=(1.0, None))]
     files = [curves.comparison(panels, tmp_path / name, "title", "note") for name in ("x.png", "y.png")]

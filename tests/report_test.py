@@ -161,34 +161,52 @@ def test_every_arm_and_every_run_is_there_as_text(page, text):
 
 def test_numbers_by_hand(page):
     # rl ends at 0.75 on average. Areas: (0.25 + 0.75) / 2 and (0 + 0.25) / 2; joint's (0.5 + 1) / 2, twice.
-    # Two runs drawn again are all four pairs of them, so the limits of a difference are its extremes.
+    # t of one degree of freedom is 12.706, and the standard errors of rl's means are 0.25 and 0.1875; joint's
+    # runs are alike, so its means have no interval, and the difference has rl's error and degree of freedom.
     table = page.table("Statistics of Catch")
     assert table["arm"][1::2] == ["return at 200", "mean return up to 200", "env steps to reach 0.75"]
-    assert table["rl"][0] == "2" and table["rl"][1] == "0.75 [0.50, 1.00]" and table["rl"][2] == "–"
-    assert table["rl"][3] == "0.31 [0.12, 0.50]"
+    assert table["rl"][0] == "2" and table["rl"][1] == "0.75 [−2.43, 3.93]" and table["rl"][2] == "–"
+    assert table["rl"][3] == "0.31 [−2.07, 2.69]"
     # One of rl's two runs is at 0.75 after 150 env steps, the other one never.
-    assert table["rl"][5] == "> 200 [150, > 200], 1 of 2 did"
-    assert table["joint"][1:3] == ["1.00 [1.00, 1.00]", "+0.25 [0.00, 0.50]"]
-    assert table["joint"][3:5] == ["0.75 [0.75, 0.75]", "+0.44 [0.25, 0.62]"]
-    assert table["joint"][5] == "75 [75, 75], 2 of 2 did"
+    assert table["rl"][5] == "> 200 [150, > 200] too narrow, 1 of 2 did"
+    assert table["joint"][1:3] == ["1.00 (no interval)", "+0.25 [−2.93, +3.43]"]
+    assert table["joint"][3:5] == ["0.75 (no interval)", "+0.44 [−1.94, +2.82]"]
+    assert table["joint"][5] == "75 [75, 75] too narrow, 2 of 2 did"
     assert table[ODD][:3] == ["1", "−1.00 (no interval)", "−1.75 (no interval)"]
     assert "Compared up to 200 env steps, where rl, seed 0, ended." in page.text
     # Human-normalised: a miss is -1 and a catch 1. A tie counts half: (0.5 + 1) / 2.
     over = page.table("The return at the end, over games")
-    assert over["joint"][1] == "1.00 [1.00, 1.00]" and over["rl"][1] == "0.88 [0.75, 1.00]"
-    assert over["joint"][4:] == ["0.00 [0.00, 0.00]", "0.75 [0.50, 1.00]"]
+    # Of one game the mean has its t interval, 0.125 * 12.706 to either side; what is no mean is drawn again.
+    assert over["joint"][1] == "1.00 (no interval)" and over["rl"][1] == "0.88 [−0.71, 2.46]"
+    assert over["joint"][4:] == ["0.00 (no interval)", "0.75 [0.50, 1.00] too narrow"]
 
 
-def test_two_seeds_tell_nothing(page):
-    assert "rl has 0.31 [0.12, 0.50]. Too few seeds to say whether they differ from it: joint;" in page.text
-    assert "Above it" not in page.text
-    assert (
-        "1 arm without an interval" in page.text and "contains the truth in about 67 % of cases" in page.text
-    )
+def test_two_seeds_tell_little(page):
+    assert "rl has 0.31 [−2.07, 2.69]. No arm differs from it by Welch's t test at 5 %." in page.text
+    assert "Above it" not in page.text and "▲" not in "".join(page.table("Statistics of Catch")["joint"])
+    assert "1 arm without an interval" in page.text
+
+
+def test_over_games_nothing_is_said_of_a_bootstrap_that_is_too_narrow(tmp_path):
+    for game in ("Catch", "CatchDistractor"):
+        for arm, end in (("rl_only_256", 0.0), ("joint_256", 5.0)):
+            mode = "rl_only" if arm == "rl_only_256" else "joint"
+            for seed in range(3):
+                write_run(
+                    tmp_path / game / arm / f"seed{seed}", [0.0, end + seed], seed=seed, mode=mode, game=game
+                )
+    page = Page(build(tmp_path, media=False))
+    over = page.text.partition("Over games, interquartile mean")[2]
+    assert "Too few seeds to say whether they differ from it: joint_256;" in over
+    assert "Above it" not in over.partition("Intervals are")[0]
+    assert page.table("The return at the end, over games")["joint_256"][0].endswith("too narrow")
+    # On each game alone Welch's test tells: 5 apart, a standard error of sqrt(2 / 3), and 2.776 times that.
+    assert "Above it, by Welch's t test at 5 %: joint_256 (+5.00 [+2.73, +7.27] over it)." in page.text
 
 
 def test_the_sentences_say_what_the_intervals_say(tmp_path):
-    # Areas: rl 0, 0.25, 0.5; above 1, three times; near 0, 0.25, 0.75.
+    # Areas: rl 0, 0.25, 0.5; above 1, three times; near 0, 0.25, 0.75. The standard error of rl's mean is
+    # 0.25 / sqrt(3), t of two degrees of freedom 4.303, and those of its difference from above are the same.
     ends = {"rl": [0.0, 0.5, 1.0], "near": [0.0, 0.5, 1.5], "above": [2.0, 2.0, 2.0]}
     for arm, values in ends.items():
         mode = "rl_only" if arm == "rl" else "joint"
@@ -196,7 +214,7 @@ def test_the_sentences_say_what_the_intervals_say(tmp_path):
             write_run(tmp_path / arm / f"seed{seed}", [0.0, value / 2, value], seed=seed, mode=mode)
     page = Page(build(tmp_path, media=False))
     assert (
-        "rl has 0.25 [0.00, 0.50]. Above it, by an interval that excludes 0: above (0.75 [0.50, 1.00])."
+        "rl has 0.25 [−0.37, 0.87]. Above it, by Welch's t test at 5 %: above (+0.75 [+0.13, +1.37] over it)."
         in (page.text)
     )
     assert "Not told apart from it: near." in page.text and "Too few" not in page.text

@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 import warnings
+from fractions import Fraction
 from functools import partial
 
 import numpy as np
@@ -18,9 +19,13 @@ from srl_jax.statistics import (
     bootstrap,
     bootstrap_difference,
     curve_interval,
+    estimate,
+    estimate_difference,
     human_normalised,
     interquartile_mean,
     mean,
+    mean_difference,
+    mean_interval,
     median,
     optimality_gap,
     percentile_interval,
@@ -30,11 +35,15 @@ from srl_jax.statistics import (
     runs_text,
     steps_to,
     summary,
+    t_probability,
+    t_quantile,
+    welch_p,
 )
 
 with warnings.catch_warnings():  # what other packages warn of while they are imported
     warnings.simplefilter("ignore")
     from rliable import library, metrics
+    from scipy import stats
 
 SCORES = np.random.default_rng(0).normal(0.6, 0.7, size=(6, 4))
 OTHERS = np.random.default_rng(1).normal(0.5, 0.7, size=(5, 4)).round(1)
@@ -174,23 +183,23 @@ def test_intervals_of_profiles_are_rliables_for_the_same_draws():
 def test_draws_are_with_replacement_within_a_game():
     # Game a: a mean of 0, 0.5, 0.5 or 1 over two draws, each with 1/4; game b: always 10.
     scores = {"a": [1.0, 0.0], "b": [10.0, 10.0]}
-    assert bootstrap(mean, scores, level=0.6) == (5.25, 5.0, 5.5)
-    assert bootstrap(mean, scores, level=0.4) == (5.25, 5.25, 5.25)
+    assert bootstrap(mean, scores, level=0.6)[:3] == (5.25, 5.0, 5.5)
+    assert bootstrap(mean, scores, level=0.4)[:3] == (5.25, 5.25, 5.25)
 
 
 def test_arms_are_drawn_independently():
     arm = {"a": [0.0, 1.0]}
     # The difference is -1 or 1 with 1/16 each, so 0.9 holds both; drawn alike it would be 0 throughout.
-    assert bootstrap_difference(arm, arm, level=0.9) == (0, -1, 1)
-    assert bootstrap(probability_of_improvement, arm, arm, level=0.9) == (0.5, 0, 1)
+    assert bootstrap_difference(arm, arm, level=0.9)[:3] == (0, -1, 1)
+    assert bootstrap(probability_of_improvement, arm, arm, level=0.9)[:3] == (0.5, 0, 1)
     shifted = bootstrap_difference(SCORES + 3, SCORES, median, seed=2)
     assert shifted.point == pytest.approx(3) and shifted.low < 3 < shifted.high
 
 
 def test_equal_arms_are_neither_better_nor_worse():
     same = np.full((4, 2), 0.3)
-    assert bootstrap(probability_of_improvement, same, same) == (0.5, 0.5, 0.5)
-    assert bootstrap_difference(same, same) == (0, 0, 0)
+    assert bootstrap(probability_of_improvement, same, same)[:3] == (0.5, 0.5, 0.5)
+    assert bootstrap_difference(same, same)[:3] == (0, 0, 0)
 
 
 @given(order=st.permutations(range(6)), seed=st.integers(0, 100))
@@ -213,8 +222,111 @@ def test_the_interval_of_ten_normal_runs_covers_less_than_it_says_but_not_by_muc
     assert 0.85 < covered < 0.97
 
 
+def test_t_intervals_of_hand_worked_scores():
+    # 1, 2, 3: the standard error is 1 / sqrt(3), and t of two degrees of freedom 4.3027 (any table).
+    margin = 4.302653 / np.sqrt(3)
+    assert mean_interval([1, 3, 2])[:3] == pytest.approx((2, 2 - margin, 2 + margin))
+    # Of arms with the same spread and number of runs Welch has both arms' degrees of freedom, 4: 2.7764.
+    margin = 2.776445 * np.sqrt(2 / 3)
+    assert mean_difference([5, 6, 7], [1, 3, 2])[:3] == pytest.approx((4, 4 - margin, 4 + margin))
+    assert (
+        mean_interval([0.0, 1.0]).kind == "Student's t"
+        and mean_difference([0, 1], [0, 1]).kind == "Welch's t"
+    )
+
+
+def test_t_is_scipys():
+    freedom = np.array([1, 1.01, 1.4, 2, 2.5, 3, 4, 7.7, 10, 30, 100, 1000])
+    for level in (0.1, 0.5, 0.9, 0.95, 0.99, 0.999):
+        np.testing.assert_allclose(
+            t_quantile(level, freedom), stats.t.ppf((1 + level) / 2, freedom), rtol=1e-7
+        )
+    for t in (0, 1e-6, 0.3, 1, 2, 5, 30, 1000):
+        np.testing.assert_allclose(t_probability(t, freedom), 1 - 2 * stats.t.sf(t, freedom), atol=1e-7)
+
+
+@given(
+    x=st.lists(st.integers(-40, 80), min_size=2, max_size=9),
+    y=st.lists(st.integers(-40, 80), min_size=2, max_size=9),
+)
+def test_intervals_and_p_values_of_differences_are_scipys(x, y):
+    difference, p = mean_difference(x, y), welch_p(x, y)
+    if len(set(x)) == len(set(y)) == 1:  # no spread at all: no interval, no test
+        assert np.isnan(difference.low) and np.isnan(p)
+        return
+    theirs = stats.ttest_ind(x, y, equal_var=False)
+    assert p == pytest.approx(theirs.pvalue, abs=1e-7)
+    low, high = theirs.confidence_interval(0.95)
+    assert difference[:3] == pytest.approx((np.mean(x) - np.mean(y), low, high), rel=1e-6, abs=1e-9)
+    if abs(p - 0.05) > 1e-6:
+        assert (p < 0.05) == (not difference.low <= 0 <= difference.high)
+
+
+def test_differences_of_real_runs():
+    # Areas under the curve of five seeds an arm, of experiments/results/catch_weight. Of the first, the
+    # bootstrap's interval leaves out 0, [-0.166, -0.010], and Welch's does not; of the second it just does.
+    rl, joint = [-0.333, -0.470, -0.494, -0.279, -0.416], [-0.521, -0.440, -0.526, -0.444, -0.489]
+    found = mean_difference(joint, rl)
+    assert found[:3] == pytest.approx((-0.086, -0.197, 0.026), abs=5e-4)
+    assert welch_p(joint, rl) == pytest.approx(0.107, abs=5e-4)
+    assert bootstrap_difference({"g": joint}, {"g": rl}).high < 0
+    rl, joint = [-0.113, -0.082, -0.079, 0.062, -0.229], [0.114, -0.011, 0.173, 0.130, -0.068]
+    assert mean_difference(joint, rl)[:3] == pytest.approx((0.156, 0.006, 0.306), abs=5e-4)
+    assert welch_p(joint, rl) == pytest.approx(0.044, abs=5e-4)
+
+
+def test_t_intervals_keep_leading_axes_and_need_spread():
+    x, y = np.random.default_rng(8).normal(size=(2, 3, 4, 5))
+    for found, one in (
+        (mean_interval(x), lambda i: mean_interval(x[i])),
+        (mean_difference(x, y[..., :3]), lambda i: mean_difference(x[i], y[i][..., :3])),
+    ):
+        for i in np.ndindex(3, 4):
+            assert [values[i] for values in found[:3]] == pytest.approx(one(i)[:3], rel=1e-12)
+    assert mean_interval(x[0, 0]) == mean_interval(x[0, 0, ::-1])  # the order changes no bit
+    # Equal runs say nothing of the spread, also where their mean is rounded; one arm with some is enough.
+    assert np.isnan(mean_interval([0.1] * 3).low) and np.isnan(mean_difference([0.1] * 3, [0.3] * 3).low)
+    assert mean_difference([1.0] * 3, [1.0, 2.0]).low < 0
+    for found in (mean_interval([1.0]), mean_difference([1.0, 2.0], [3.0])):
+        assert np.isnan(found.low) and np.isnan(found.high) and found.kind == statistics.NONE
+
+
+def test_which_interval_is_right_for_what():
+    one, two = {"a": [0.0, 1.0, 3.0]}, {"a": [0.0, 1.0, 3.0], "b": [1.0, 2.0]}
+    other = {"a": [2.0, 2.5]}
+    assert estimate(mean, one) == mean_interval(one["a"])
+    assert estimate(median, one)[:3] == estimate(mean, one)[:3]
+    assert estimate(optimality_gap, one)[:3] == pytest.approx(mean_interval([1.0, 0.0, 0.0])[:3])
+    assert estimate_difference(one, other) == mean_difference(one["a"], other["a"])
+    # All else is drawn again, and too narrow with fewer than five runs of some game.
+    for statistic in (mean, median, optimality_gap):
+        assert estimate(statistic, two) == bootstrap(statistic, two)
+    assert estimate(interquartile_mean, one) == bootstrap(interquartile_mean, one)
+    assert estimate(probability_of_improvement, one, other).kind == statistics.NARROW
+    assert estimate_difference(two, two).kind == statistics.NARROW
+    assert estimate(mean, SCORES).kind == statistics.BOOTSTRAP
+    assert curve_interval(np.ones((3, 2, 4)) * [[[1.0]], [[2.0]], [[3.0]]]).kind == statistics.NARROW
+    with pytest.raises(ValueError, match="the games differ: a, b and a"):
+        estimate_difference(two, one)
+
+
+def test_the_interquartile_mean_of_many_different_numbers_of_runs():
+    # The least common multiple of these is 3e18 and more than an int64 holds, so by exact fractions:
+    scores = {str(n): np.arange(n) % 50 + n / 1000 for n in (101, 103, 107, 109, 113, 127, 131, 137, 139)}
+    weighed = sorted((x, Fraction(1, len(game))) for game in scores.values() for x in game)
+    cut, total, upto = Fraction(len(scores), 4), Fraction(0), Fraction(0)
+    for x, weight in weighed:
+        kept = max(0, min(upto + weight, len(scores) - cut) - max(upto, cut))
+        total, upto = total + kept * Fraction(x), upto + weight
+    assert interquartile_mean(scores) == pytest.approx(float(total / (len(scores) - 2 * cut)), rel=1e-12)
+    assert interquartile_mean({str(n): np.full(n, 2.5) for n in range(3, 44)}) == pytest.approx(
+        2.5, rel=1e-12
+    )
+
+
 def test_a_single_run_has_no_interval():
-    point, low, high = bootstrap(mean, {"a": [1.0], "b": [2.0, 4.0]})
+    point, low, high, kind = bootstrap(mean, {"a": [1.0], "b": [2.0, 4.0]})
+    assert kind == statistics.NONE
     assert point == 2 and np.isnan(low) and np.isnan(high)
     assert np.isnan(curve_interval([[1.0, 2.0]]).low).all()
 
@@ -232,6 +344,10 @@ def test_a_single_run_has_no_interval():
         (lambda: bootstrap_difference(SCORES, SCORES[:, :2]), "the games differ"),
         (lambda: curve_interval([1.0, 2.0]), "curves are"),
         (lambda: curve_interval({"a": np.ones((2, 3)), "b": np.ones((2, 4))}), "same points"),
+        (lambda: mean_interval([]), "no runs"),
+        (lambda: mean_interval(1.0), "no runs"),
+        (lambda: mean_difference([1, 2], [1, np.inf]), "not all finite"),
+        (lambda: mean_interval([1, 2], level=0), "level=0"),
         (lambda: at_equal_steps([]), "no curves"),
         (lambda: at_equal_steps([([0, 10], [1, 2]), ([20, 30], [1, 2])]), "all 2 curves have"),
         (lambda: at_equal_steps([([0, 10, 10], [1, 2, 3])]), "whole and ascending"),
@@ -249,14 +365,19 @@ def test_what_cannot_be_computed_is_said_in_a_line(call, message):
 
 def test_curves_have_the_interval_that_their_points_have(monkeypatch):
     curves = np.sort(np.random.default_rng(7).normal(size=(5, 3, 4)), axis=0)  # as bootstrap sorts runs
-    found = curve_interval(curves, interquartile_mean, seed=9, repetitions=200)
+    found = curve_interval(curves, interquartile_mean, seed=9, repetitions=200)[:3]
     for point in range(4):
         expected = bootstrap(interquartile_mean, curves[..., point], seed=9, repetitions=200)
-        np.testing.assert_allclose([x[point] for x in found], expected, rtol=1e-12)
+        np.testing.assert_allclose([x[point] for x in found], expected[:3], rtol=1e-12)
     monkeypatch.setattr("srl_jax.statistics.intervals._BLOCK", 1)  # a point at a time
-    np.testing.assert_array_equal(found, curve_interval(curves, interquartile_mean, seed=9, repetitions=200))
-    one = curve_interval(curves[:, 0], seed=1)
-    np.testing.assert_array_equal(one, curve_interval({"Pong": curves[:, 0]}, seed=1))
+    again = curve_interval(curves, interquartile_mean, seed=9, repetitions=200)
+    np.testing.assert_array_equal(found, again[:3])
+    one = curve_interval(curves[:, 0])
+    np.testing.assert_array_equal(one[:3], curve_interval({"Pong": curves[:, 0]})[:3])
+    for point in range(4):
+        expected = mean_interval(curves[:, 0, point])
+        assert [x[point] for x in one[:3]] == pytest.approx(expected[:3], rel=1e-12)
+    assert one.kind == statistics.STUDENT
 
 
 def test_curves_meet_where_all_of_them_are():
@@ -312,6 +433,10 @@ def test_a_summary_has_every_number_with_its_interval_and_its_runs():
     assert by_key["joint", "Breakout", "return"]["point"] == pytest.approx(16.1)
     assert by_key["joint", "Breakout", "return"]["runs"] == "2 runs"
     assert by_key["rl_only", "Qbert", "return"]["low"] is None
+    kinds = {key: row["kind"] for key, row in by_key.items()}
+    assert kinds["joint", "Pong", "return"] == "Student's t"
+    assert kinds["joint", "Pong", "return_difference"] == "Welch's t"
+    assert kinds["joint", None, "interquartile_mean"] == "stratified bootstrap, too narrow"
     better = by_key["joint", None, "probability_of_improvement"]
     assert better["against"] == "rl_only" and better["point"] == pytest.approx((2 + 0.5) / 3)
     assert by_key["joint", None, "mean_difference"]["point"] == pytest.approx(2 / 3)

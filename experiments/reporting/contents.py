@@ -1,5 +1,6 @@
 """What all sections of a report start from, and how they show intervals."""
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
@@ -7,14 +8,13 @@ import numpy as np
 
 from experiments import collect
 from experiments.collect import RunData
+from experiments.colours import Style, styles
 from experiments.reporting.markup import Markup, number
 from experiments.reporting.numbers import Comparison, Row
-from srl_jax.statistics import Interval
+from srl_jax.statistics import NARROW, Interval
 
 Content = Markup | list | None
 """Of a section; None for none."""
-TELLING = 3
-"""Seeds of both arms from which a difference is said to have a side: the interval of two is their range."""
 
 
 class Report(NamedTuple):
@@ -53,16 +53,10 @@ class Report(NamedTuple):
         """The runs of a game, or of one arm on it."""
         return [run for run in self.runs if run.game == game and arm in (None, run.arm)]
 
-    def seeds_behind(self, arm: str, game: str | None = None) -> int:
-        """Of a difference from the baseline: the fewest that it or the arm has, on the game or on any."""
-        games = [game] if game is not None else self.comparisons
-        counts = [
-            len(comparison.returns.get(name, ()))
-            for name in (arm, self.baseline)
-            for comparison in (self.comparisons[game] for game in games)
-            if comparison is not None
-        ]
-        return min(counts, default=0)
+    @property
+    def styles(self) -> dict[str, Style]:
+        """How each arm is drawn, in all pictures of the page."""
+        return styles(self.arms)
 
 
 def run_name(run: RunData) -> str:
@@ -70,15 +64,27 @@ def run_name(run: RunData) -> str:
     return f"{run.game} / {run.arm} / seed {run.seed}"
 
 
-def limits(interval: Interval) -> str:
-    """[low, high], or that there is none."""
+def limits(interval: Interval, shown: Callable[[float], str] = number) -> str:
+    """[low, high], and a word where few runs make it too narrow; or that there is none."""
     if np.isnan(interval.low):
         return "(no interval)"
-    return f"[{number(float(interval.low))}, {number(float(interval.high))}]"
+    narrow = " too narrow" if interval.kind == NARROW else ""
+    return f"[{shown(float(interval.low))}, {shown(float(interval.high))}]{narrow}"
 
 
-def side(interval: Interval, seeds: int) -> int:
-    """1 or -1 where the interval of a difference is above or below 0, else 0, as for fewer than `TELLING`."""
-    if seeds < TELLING:
+def signed(value: float) -> str:
+    """A difference: +0.24, −0.24 or 0.00."""
+    text = number(value)
+    return f"+{text}" if value > 0 and text.strip("0.,") else text
+
+
+def difference_text(interval: Interval) -> str:
+    """A difference and its limits, all with their signs."""
+    return f"{signed(float(interval.point))} {limits(interval, signed)}"
+
+
+def side(interval: Interval) -> int:
+    """1 or -1 where the interval of a difference is above or below 0; else 0, as where it is too narrow."""
+    if interval.kind == NARROW:
         return 0
     return int(interval.low > 0) - int(interval.high < 0)

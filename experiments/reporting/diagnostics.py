@@ -1,13 +1,14 @@
 """The diagnostics of eval rows, `diag/...`, as small pictures: one number each, a line an arm."""
 
 import fnmatch
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from experiments import collect
 from experiments.collect import RunData
+from experiments.colours import Style
 from experiments.reporting import pictures
 from experiments.reporting.numbers import numbers_of
 from experiments.reporting.pictures import Picture
@@ -90,8 +91,12 @@ def keys_of(runs: Sequence[RunData]) -> list[str]:
     return sorted(key for key in keys if key.startswith("diag/") and key != LISTS_OVER)
 
 
-def panels(runs: Sequence[RunData], arms: Sequence[str]) -> list[Panel]:
+def panels(runs: Sequence[RunData], looks: Mapping[str, Style]) -> list[Panel]:
     """The pictures of one game's runs; keys that say nothing anywhere are left out.
+
+    Args:
+        runs: those of other arms are left out.
+        looks: arm -> its colour and line.
 
     Raises:
         ConfigError: a value is no number.
@@ -101,11 +106,11 @@ def panels(runs: Sequence[RunData], arms: Sequence[str]) -> list[Panel]:
     found = []
     for form in [*FORMS, *(Form(key, key.removeprefix("diag/")) for key in keys if key not in known)]:
         for key in _matching(form, keys):
-            lines = {}
-            for place, arm in enumerate(arms):
+            lines = []
+            for arm, style in looks.items():
                 members = [_curve(run, key, form.place) for run in runs if run.arm == arm]
                 if (curve := pictures.interval_curves(members)) is not None:
-                    lines[place] = curve
+                    lines.append((style, curve))
             if lines:
                 title = form.title.format(_middle(key, form.key))
                 found.append(Panel(title, form.meaning, pictures.curves(title, lines), form.first))

@@ -1,7 +1,7 @@
 """The pictures of a report, in their sections."""
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,10 +63,10 @@ def learning_curves(report: Report) -> Content:
         curves = {}
         for arm in arms:
             interval = statistics.curve_interval(comparison.returns[arm])
-            curves[report.arms.index(arm)] = pictures.Curve(comparison.steps, *interval)
-        limits = _limits_of(curves.values(), levels)
+            curves[arm] = pictures.Curve(comparison.steps, *interval[:3])
+        limits = pictures.heights(list(curves.values()), levels)  # the same in all pictures of a game
         for group in groups(arms, report.baseline):
-            lines = {report.arms.index(arm): curves[report.arms.index(arm)] for arm in group}
+            lines = [(report.styles[arm], curves[arm]) for arm in group]
             picture = pictures.curves(
                 game, lines, size=(5.4, 3.5), label="mean return", levels=levels, limits=limits
             )
@@ -75,7 +75,8 @@ def learning_curves(report: Report) -> Content:
     if not drawn:
         return None
     note = (
-        "Mean evaluation return, and its 95 % interval over seeds, at env steps that all runs of a game have."
+        "Mean evaluation return, and its 95 % t interval over seeds at each env step that all runs of a game "
+        "have."
     )
     return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
 
@@ -85,13 +86,13 @@ def profiles(report: Report) -> Content:
     games, thresholds, found = numbers.profiles(report.comparisons, report.arms)
     if all(np.isnan(interval.low).all() for interval in found.values()):  # a single seed has no distribution
         return None
-    curves = {arm: pictures.Curve(thresholds, *interval) for arm, interval in found.items()}
+    curves = {arm: pictures.Curve(thresholds, *interval[:3]) for arm, interval in found.items()}
     seeds = {arm: sum(len(report.comparisons[game].returns[arm]) for game in games) for arm in found}
     drawn = []
     for group in groups(list(found), report.baseline):
         picture = pictures.curves(
             listed(games),
-            {report.arms.index(arm): curves[arm] for arm in group},
+            [(report.styles[arm], curves[arm]) for arm in group],
             size=(5.4, 3.5),
             label="share of runs above it",
             across="human-normalised return at the end",
@@ -99,20 +100,13 @@ def profiles(report: Report) -> Content:
         )
         caption = _legend(report, {arm: seeds[arm] for arm in group}, "run")
         drawn.append(figure(picture.source, caption, "Performance profiles", picture.size))
+    kinds = dict.fromkeys(interval.kind for interval in found.values() if interval.kind != statistics.NONE)
     note = (
-        "The share of an arm's runs that end above a score, averaged over games, and its 95 % interval. A "
-        "curve that is higher everywhere is better; where it falls steeply, runs end alike. 0 is a random "
-        "policy, 1 a human; in Catch, a miss and a catch."
+        "The share of an arm's runs that end above a score, averaged over games, and its 95 % interval, "
+        f"{listed(kinds)}. A curve that is higher everywhere is better; where it falls steeply, runs end "
+        "alike. 0 is a random policy, 1 a human; in Catch, a miss and a catch."
     )
     return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
-
-
-def _limits_of(curves: Iterable[pictures.Curve], levels: Sequence[tuple[str, float]]) -> tuple[float, float]:
-    """Of the vertical axis of all pictures of a game, so that they can be compared."""
-    values = np.concatenate([*(np.concatenate(curve[1:]) for curve in curves), [y for _, y in levels]])
-    low, high = np.nanmin(values), np.nanmax(values)
-    room = 0.05 * (high - low) or 0.5
-    return float(low - room), float(high + room)
 
 
 def groups(arms: Sequence[str], baseline: str | None) -> list[list[str]]:
@@ -132,7 +126,7 @@ def _legend(report: Report, counts: dict[str, int], of: str = "seed") -> Markup:
     words = {"-": "solid", "--": "dashed", ":": "dotted"}
     items = []
     for arm, number in counts.items():
-        colour, line = pictures.style(report.arms.index(arm))
+        colour, line = report.styles[arm]
         mark = tag("span", style=f"border-top-color: {colour}; border-top-style: {words[line]}")
         items.append(tag("li", mark, f"{arm} ({plural(number, of)})"))
     return tag("ul", items, class_="legend")
@@ -205,7 +199,7 @@ def diagnostic_pictures(report: Report) -> Content:
         )
     parts: list = []
     for game in report.games:
-        found = diagnostics.panels(report.of(game), report.arms)
+        found = diagnostics.panels(report.of(game), report.styles)
         if not found:
             continue
         first, others = (
@@ -220,7 +214,7 @@ def diagnostic_pictures(report: Report) -> Content:
         parts.append(_drift(report, game))
     if without:
         parts.append(tag("p", f"Without diagnostics: {listed(map(run_name, without))}.", class_="note"))
-    note = "Measured at every evaluation; means and 95 % intervals over seeds."
+    note = "Measured at every evaluation; means over seeds and their 95 % t intervals at each point."
     return [tag("p", note, class_="note"), *parts]
 
 

@@ -206,7 +206,7 @@ def profiles(
     def profile(drawn: Mapping[str, np.ndarray]) -> np.ndarray:
         return statistics.performance_profile(drawn, thresholds)
 
-    return games, thresholds, {arm: statistics.bootstrap(profile, mine) for arm, mine in normal.items()}
+    return games, thresholds, {arm: statistics.estimate(profile, mine) for arm, mine in normal.items()}
 
 
 def targets(
@@ -238,14 +238,14 @@ def rows(
             if arm != baseline and game in final.get(baseline, {}):
                 theirs = [{game: x[baseline][game]} for x in (final, area)]
                 differences = [
-                    statistics.bootstrap_difference(x, y) for x, y in zip(mine, theirs, strict=True)
+                    statistics.estimate_difference(x, y) for x, y in zip(mine, theirs, strict=True)
                 ]
-            values = [statistics.bootstrap(statistics.mean, x) for x in mine]
+            values = [statistics.estimate(statistics.mean, x) for x in mine]
             taken = np.full(len(comparison.returns[arm]), np.nan)
             if game in wanted:
                 taken = statistics.steps_to(comparison.steps, comparison.returns[arm], wanted[game])
             never = np.isnan(taken)
-            reaching = statistics.bootstrap(_median_run, {game: np.where(never, NEVER, taken)})
+            reaching = statistics.estimate(_median_run, {game: np.where(never, NEVER, taken)})
             found.append(Row(game, arm, len(taken), *values, *differences, reaching, int((~never).sum())))
     return found
 

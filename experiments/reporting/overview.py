@@ -7,15 +7,14 @@ import numpy as np
 from experiments import collect
 from experiments.reporting import configs, numbers, pictures
 from experiments.reporting.configs import About
-from experiments.reporting.contents import TELLING, Content, Report, limits, run_name, side
+from experiments.reporting.contents import Content, Report, difference_text, limits, run_name, side
 from experiments.reporting.markup import Markup, details, figure, listed, number, plural, table, tag
 from experiments.reporting.numbers import Row
 from experiments.reporting.tables import interval_of, summary_of
-from srl_jax.statistics import Interval
+from srl_jax.statistics import BOOTSTRAP, ENOUGH, NARROW, WELCH, Interval
 
-COVERAGE = {2: 67, 3: 80, 4: 85, 5: 88, 7: 90, 10: 92, 20: 94}
-"""Seeds -> how many percent of 95 % intervals of a difference on one game contain the truth, where returns
-are normal: simulated, see `srl_jax.statistics`."""
+TESTS = {WELCH: "Welch's t test at 5 %", BOOTSTRAP: "a 95 % bootstrap interval that leaves out 0"}
+"""What it is that an interval of this kind leaves out 0."""
 FEW_ARMS = 3
 """Arms whose differences are said in the text; more are in the tables alone."""
 
@@ -107,24 +106,19 @@ def what_it_says(report: Report) -> Content:
         items = []
         for what, of in (("Return at the end", "final"), ("Return averaged over env steps", "area")):
             found = {arm: getattr(row, f"{of}_difference") for arm, row in rows.items()}
-            items.append(_sentence(report, what, getattr(base, of), found, game))
+            items.append(_sentence(report, what, getattr(base, of), found))
         parts.append(tag("ul", items))
         pictured += _picture(report, game, rows)
     parts += _over_games(report)
     parts.append(tag("div", pictured, class_="grid wide") if pictured else None)
     if not any(parts):
         return None
-    fewest = min((row.seeds for row in report.rows if row.seeds > 1), default=0)
     note = (
-        "Intervals are 95 % stratified-bootstrap intervals over seeds. Among many comparisons, some leave 0 "
-        "out by chance: read a difference that only just does as a hint. "
+        "Intervals are 95 % intervals over seeds: on one game Student's t of a mean and Welch's t of a "
+        "difference, over games the stratified bootstrap. That a Welch interval leaves out 0 is a two-sided "
+        "test at 5 %: of twenty comparisons of like arms, one does so by chance on average. Read a "
+        "difference that only just does as a hint. The bootstrap's is such a test only roughly."
     )
-    if fewest:
-        known = max(seeds for seeds in COVERAGE if seeds <= fewest)
-        note += (
-            f"With {plural(fewest, 'seed')}, such an interval of a difference contains the truth in about "
-            f"{COVERAGE[known]} % of cases, where returns are normal."
-        )
     parts.append(tag("p", note, class_="note"))
     return parts
 
@@ -138,9 +132,9 @@ def _picture(report: Report, game: str, rows: dict[str, Row]) -> list:
         "at the end": {arm: row.final_difference for arm, row in rows.items()},
         "averaged over env steps": {arm: row.area_difference for arm, row in rows.items()},
     }
-    places = [report.arms.index(arm) for arm in rows]
-    picture = pictures.differences(game, report.baseline, panels, places)
-    caption = f"{game}: returns less those of {report.baseline}, and their 95 % intervals"
+    looks = [report.styles[arm] for arm in rows]
+    picture = pictures.differences(game, report.baseline, panels, looks)
+    caption = f"{game}: returns less those of {report.baseline}, and their 95 % intervals, Welch's t"
     return [figure(picture.source, caption, f"{game}: differences from {report.baseline}", picture.size)]
 
 
@@ -169,43 +163,45 @@ def _sentence(
     what: str,
     base: Interval,
     differences: dict[str, Interval | None],
-    game: str | None = None,
 ) -> Markup:
     """What the baseline has, and the arms whose difference from it has an interval without 0.
+
+    On one game that is Welch's test at 5 %. Over games it is the bootstrap's, of which nothing is concluded
+    where it is too narrow.
 
     Args:
         report: with the baseline.
         what: that is compared.
         base: what the baseline has.
         differences: arm -> its difference from it.
-        game: that they are of; None for all together.
     """
     known = {arm: x for arm, x in differences.items() if x is not None and not np.isnan(x.low)}
-    seeds = {arm: report.seeds_behind(arm, game) for arm in known}
-    few = [arm for arm in known if seeds[arm] < TELLING]
-    sides = {arm: side(x, seeds[arm]) for arm, x in known.items()}
+    few = [arm for arm, x in known.items() if x.kind == NARROW]
+    sides = {arm: side(x) for arm, x in known.items()}
+    how = next((TESTS[x.kind] for x in known.values() if x.kind in TESTS), "")
     clear = {arm: x for arm, x in known.items() if sides[arm]}
     text = f"{what}: {report.baseline} has {number(float(base.point))} {limits(base)}. "
-    for word, sign in (("Above", 1), ("Below", -1)):
+    for word, sign, than in (("Above", 1, "over it"), ("Below", -1, "against it")):
         items = [arm for arm, x in clear.items() if sides[arm] == sign]
         if FEW_ARMS < len(items) == len(differences):
             items = ["all other arms"]
         elif len(items) <= FEW_ARMS:
-            items = [f"{arm} ({number(float(clear[arm].point))} {limits(clear[arm])})" for arm in items]
+            items = [f"{arm} ({difference_text(clear[arm])} {than})" for arm in items]
         if items:
-            text += f"{word} it, by an interval that excludes 0: {listed(items)}. "
+            text += f"{word} it, by {how}: {listed(items)}. "
     if others := [arm for arm in known if arm not in clear and arm not in few]:
         if clear:
             text += f"Not told apart from it: {listed(others)}. "
         else:
-            text += "No arm differs from it by an interval that excludes 0. "
+            text += f"No arm differs from it by {how}. "
     if few:
         text += (
-            f"Too few seeds to say whether they differ from it: {listed(few)}; with fewer than {TELLING}, "
-            "an interval is the range of the seeds."
+            f"Too few seeds to say whether they differ from it: {listed(few)}; with fewer than {ENOUGH} of a "
+            "game, the bootstrap's interval is too narrow. "
         )
     if unknown := len(differences) - len(known):
         text += (
-            f"{plural(unknown, 'arm')} without an interval: one seed cannot tell a difference from chance."
+            f"{plural(unknown, 'arm')} without an interval: one seed, or seeds that are all alike, cannot "
+            "tell a difference from chance."
         )
     return tag("li", text.strip())

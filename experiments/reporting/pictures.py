@@ -11,14 +11,13 @@ from typing import NamedTuple
 import numpy as np
 
 from experiments import plots
+from experiments.colours import Style
 from srl_jax import statistics
 from srl_jax.errors import ConfigError
 from srl_jax.reading import read_bytes
 
 LARGEST = 1 << 24
 """Bytes that a picture on disk may have."""
-STYLES = ("-", "--", ":")
-"""Of lines, once all colours are taken."""
 ARMS_A_PICTURE = 6
 """Lines of arms that can be told apart in one picture of learning curves."""
 
@@ -47,12 +46,6 @@ class Curve(NamedTuple):
     point: np.ndarray
     low: np.ndarray
     high: np.ndarray
-
-
-def style(index: int) -> tuple[str, str]:
-    """The colour and the line of an arm by its place."""
-    number = len(plots.COLOURS)
-    return plots.COLOURS[index % number], STYLES[index // number % len(STYLES)]
 
 
 def drawn(draw: Callable[[Path], object]) -> Picture | None:
@@ -167,12 +160,18 @@ def interval_curves(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | No
         steps, values = statistics.at_equal_steps(kept)
     except ValueError:
         return None
-    return Curve(steps, *statistics.curve_interval(values))
+    return Curve(steps, *statistics.curve_interval(values)[:3])
+
+
+def heights(curves: Sequence[Curve], levels: Sequence[tuple[str, float]] = ()) -> tuple[float, float]:
+    """Limits of a vertical axis; see `plots.heights`."""
+    lines = np.concatenate([*(curve.point for curve in curves), [height for _, height in levels]])
+    return plots.heights(lines, np.concatenate([limit for curve in curves for limit in curve[2:]]))
 
 
 def curves(
     title: str,
-    lines: Mapping[int, Curve],
+    lines: Sequence[tuple[Style, Curve]],
     *,
     size: tuple[float, float] = (3.4, 2.3),
     label: str = "",
@@ -184,20 +183,19 @@ def curves(
 
     Args:
         title: above it.
-        lines: the arm's place, which gives its style -> its curve.
+        lines: an arm's style and its curve.
         size: width and height in inches.
         label: of the vertical axis.
         across: of the horizontal axis; numbers are abbreviated where it is env steps.
         levels: names and heights of dotted lines across.
-        limits: of the vertical axis; None for what the lines need.
+        limits: of the vertical axis; None for what `plots.heights` gives.
     """
     small = size[0] < 4
 
     def draw(path: Path) -> None:
         figure = plots.new_figure(*size)
         axes = figure.add_subplot()
-        for place, curve in lines.items():
-            colour, line = style(place)
+        for (colour, line), curve in lines:
             if np.isfinite(curve.low).any():
                 axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
             width, marker = 1.5 if small else 1.8, "o" if len(curve.at) == 1 else ""
@@ -213,15 +211,14 @@ def curves(
         axes.tick_params(labelsize=7 if small else 9)
         axes.set_xlabel(across, fontsize=7.5 if small else 9)
         axes.set_ylabel(label, fontsize=9)
-        if limits is not None:
-            axes.set_ylim(*limits)
+        axes.set_ylim(*(limits or heights([curve for _, curve in lines], levels)))
         plots.save(figure, path)
 
     return drawn(draw)
 
 
 def differences(
-    title: str, baseline: str, panels: Mapping[str, Mapping[str, statistics.Interval]], places: Sequence[int]
+    title: str, baseline: str, panels: Mapping[str, Mapping[str, statistics.Interval]], looks: Sequence[Style]
 ) -> Picture:
     """A picture of how arms differ from the baseline: a point and an interval each, beside 0.
 
@@ -229,7 +226,7 @@ def differences(
         title: above it.
         baseline: its name.
         panels: what differs -> arm -> the difference; the same arms in each.
-        places: of the arms, which give their colours.
+        looks: of the arms.
     """
 
     def draw(path: Path) -> None:
@@ -239,8 +236,7 @@ def differences(
         grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
         for axes, (name, found) in zip(grid, panels.items(), strict=True):
             axes.axvline(0, color="#555555", linewidth=1)
-            for i, (interval, place) in enumerate(zip(found.values(), places, strict=True)):
-                colour, _ = style(place)
+            for i, (interval, (colour, _)) in enumerate(zip(found.values(), looks, strict=True)):
                 axes.plot([interval.low, interval.high], [i, i], color=colour, linewidth=2.2)
                 axes.plot([interval.point], [i], "o", color=colour, markersize=5)
             axes.set_yticks(range(len(arms)), arms, fontsize=8, parse_math=False)

@@ -6,12 +6,12 @@ from typing import Any
 import numpy as np
 
 from experiments.reporting import numbers
-from experiments.reporting.contents import TELLING, Content, Report, limits, side
+from experiments.reporting.contents import Content, Report, limits, side, signed
 from experiments.reporting.markup import Markup, details, number, plural, table, tag
 from experiments.reporting.numbers import Comparison, Row
 from srl_jax import statistics
 from srl_jax.data import Published, published
-from srl_jax.statistics import Interval
+from srl_jax.statistics import NARROW, Interval
 
 NEAR = 2.5
 """Published results of up to so many times as many env steps, or as few, are shown at once."""
@@ -33,10 +33,11 @@ def statistics_of(report: Report) -> Content:
     parts: list = [
         tag(
             "p",
-            "Runs of a game are compared at env steps that all of them have. In brackets: 95 % "
-            "stratified-bootstrap intervals over seeds; a single seed has none. Differences are from ",
+            "Runs of a game are compared at env steps that all of them have. In brackets: 95 % intervals "
+            "over seeds. Those of a mean on one game are Student's t, of a difference Welch's t, all others "
+            "of the stratified bootstrap; a single seed has none. Differences are from ",
             tag("strong", report.baseline),
-            f"; ▲ and ▼ mark those whose interval excludes 0, where both have {TELLING} seeds or more.",
+            "; ▲ and ▼ mark those that Welch's test at 5 % finds.",
         )
     ]
     for game, comparison in report.comparisons.items():
@@ -59,9 +60,8 @@ def _of_game(report: Report, game: str, comparison: Comparison) -> list:
     body = []
     for row in report.rows:
         if row.game == game:
-            seeds = report.seeds_behind(row.arm, game)
-            cells = [row.arm, row.seeds, _cell(row.final), _difference(row.final_difference, seeds)]
-            cells += [_cell(row.area), _difference(row.area_difference, seeds)]
+            cells = [row.arm, row.seeds, _cell(row.final), _difference(row.final_difference)]
+            cells += [_cell(row.area), _difference(row.area_difference)]
             body.append(cells + ([_reaching(row, end)] if score is not None else []))
     notes = []
     if (cut := comparison.cut_by) is not None:
@@ -82,8 +82,9 @@ def _of_game(report: Report, game: str, comparison: Comparison) -> list:
 
 
 def _reaching(row: Row, end: int) -> list:
-    shown = [f"> {end:,}" if value > end else f"{value:,.0f}" for value in row.reaching]
-    span = "" if np.isnan(row.reaching.low) else f"[{shown[1]}, {shown[2]}], "
+    shown = [f"> {end:,}" if value > end else f"{value:,.0f}" for value in row.reaching[:3]]
+    narrow = " too narrow" if row.reaching.kind == NARROW else ""
+    span = "" if np.isnan(row.reaching.low) else f"[{shown[1]}, {shown[2]}]{narrow}, "
     return [shown[0], " ", tag("span", f"{span}{row.reached} of {row.seeds} did", class_="ci")]
 
 
@@ -91,21 +92,21 @@ def _cell(interval: Interval) -> list:
     return [number(float(interval.point)), " ", tag("span", limits(interval), class_="ci")]
 
 
-def _difference(interval: Interval | None, seeds: int) -> Content:
+def _difference(interval: Interval | None) -> Content:
     if interval is None:
         return Markup("–")
-    shown = ("+" if float(interval.point) > 0 else "") + number(float(interval.point))
-    if (direction := side(interval, seeds)) > 0:
+    shown = signed(float(interval.point))
+    if (direction := side(interval)) > 0:
         shown = tag("span", f"{shown} ▲", class_="up")
     elif direction < 0:
         shown = tag("span", f"{shown} ▼", class_="down")
-    return [shown, " ", tag("span", limits(interval), class_="ci")]
+    return [shown, " ", tag("span", limits(interval, signed), class_="ci")]
 
 
 def interval_of(row: Mapping[str, Any]) -> Interval:
     """The interval of a row of `summary_of`."""
     values = (row[name] for name in ("point", "low", "high"))
-    return Interval(*(np.float64(np.nan if value is None else value) for value in values))
+    return Interval(*(np.float64(np.nan if value is None else value) for value in values), row["kind"])
 
 
 def summary_of(report: Report, of: str) -> list[dict]:

@@ -13,6 +13,9 @@ Scores = np.ndarray | Mapping[str, Any]
 Statistic = Callable[..., np.ndarray]
 """Of scores, one argument an arm; the axes before runs and games are kept."""
 
+_EXACT = 1 << 53
+"""Whole numbers up to this one are floats, and sums of them exact."""
+
 
 def human_normalised(game: str, scores: Any) -> np.ndarray:
     """Scores on a scale where 0 is a random policy's and 1 a human's, float64 of the same shape.
@@ -47,13 +50,14 @@ def interquartile_mean(scores: Scores) -> np.ndarray:
     many times as makes all games equal.
     """
     games = list(by_game(scores).values())
-    common = lcm(*(game.shape[-1] for game in games))
-    counts = np.concatenate([np.full(game.shape[-1], common // game.shape[-1]) for game in games])
+    common = lcm(*(game.shape[-1] for game in games))  # of many different numbers, larger than any float
+    unit = min(common, _EXACT)
+    counts = np.concatenate([np.full(game.shape[-1], unit / game.shape[-1]) for game in games])
     values = np.concatenate(games, axis=-1)
     order = np.argsort(values, axis=-1)
     upto = np.cumsum(counts[order], axis=-1)
-    total = common * len(games)
-    cut = total // 4
+    total = unit * len(games)
+    cut = common * len(games) // 4 * unit / common
     kept = np.diff(np.clip(upto, cut, total - cut), axis=-1, prepend=cut)
     return (kept * np.take_along_axis(values, order, -1)).sum(-1) / (total - 2 * cut)
 

@@ -1,4 +1,4 @@
-"""Intervals: the percentile interval of the stratified bootstrap, which draws runs again within each game."""
+"""Intervals; the percentile interval of the stratified bootstrap, which draws runs again within each game."""
 
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -11,6 +11,11 @@ REPETITIONS = 10_000
 """How often the bootstrap draws again where nothing else is asked for: its limits then vary by about a
 hundredth of their distance with the seed of the draws."""
 
+STUDENT, WELCH, BOOTSTRAP = "Student's t", "Welch's t", "stratified bootstrap"
+NARROW, NONE = "stratified bootstrap, too narrow", "none"
+ENOUGH = 5
+"""Runs of each game from which the bootstrap's interval is not called too narrow."""
+
 _BLOCK = 1 << 22
 """Scores that are drawn again at once, 32 MiB of them."""
 
@@ -20,13 +25,17 @@ class Interval(NamedTuple):
 
     Attributes:
         point: float64, the statistic of the scores themselves.
-        low: float64 of the same shape, the interval's lower limit; NaN where some game has a single run.
+        low: float64 of the same shape, the interval's lower limit; NaN where there is none, as with a game
+            that has a single run.
         high: float64 of the same shape, the upper limit, likewise.
+        kind: how it was made: STUDENT, WELCH, BOOTSTRAP, NARROW (a bootstrap of fewer than `ENOUGH` runs of
+            some game) or NONE (of a single run).
     """
 
     point: np.ndarray
     low: np.ndarray
     high: np.ndarray
+    kind: str
 
 
 def bootstrap(
@@ -85,25 +94,24 @@ def percentile_interval(values: np.ndarray, level: float = 0.95) -> tuple[np.nda
     Returns:
         low and high, float64 [...].
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level={level}: must be between 0 and 1")
+    check_level(level)
     tail = (1 - level) / 2
     low, high = np.percentile(values, [100 * tail, 100 * (1 - tail)], axis=0)
     return low, high
 
 
-def curve_interval(
-    returns: Scores,
+def bootstrap_curve(
+    returns: Any,
     statistic: Statistic = mean,
     *,
     repetitions: int = REPETITIONS,
     level: float = 0.95,
     seed: int = 0,
 ) -> Interval:
-    """A statistic of learning curves and its interval at each point; whole curves are drawn again.
+    """A statistic of learning curves and its percentile interval at each point; whole curves are drawn again.
 
     Args:
-        returns: float64 [runs, points] of one game, [runs, games, points], or game -> [runs, points].
+        returns: see `curves_by_game`.
         statistic: of one arm's scores.
         repetitions: see `bootstrap`.
         level: of the interval at one point; not of the whole curve.
@@ -112,16 +120,7 @@ def curve_interval(
     Returns:
         An Interval of arrays [points].
     """
-    if not isinstance(returns, Mapping):
-        returns = np.asarray(returns, np.float64)
-        if returns.ndim not in (2, 3):
-            raise ValueError("curves are [runs, points], [runs, games, points], or game -> [runs, points]")
-        games = returns[:, None] if returns.ndim == 2 else returns
-        returns = {str(i): games[:, i] for i in range(games.shape[1])}
-    curves = {game: np.asarray(x, np.float64) for game, x in returns.items()}
-    if any(x.ndim != 2 for x in curves.values()) or len({x.shape[1] for x in curves.values()}) != 1:
-        raise ValueError("curves of all games and runs must have the same points; see at_equal_steps")
-    games = by_game({game: x.T for game, x in curves.items()})
+    games = curves_by_game(returns)
     draws = _draw(games, repetitions, np.random.default_rng(seed))
     block = max(1, _BLOCK // (repetitions * sum(x.shape[-1] for x in games.values())))
     points = next(iter(games.values())).shape[0]
@@ -132,6 +131,33 @@ def curve_interval(
         limits.append(percentile_interval(np.moveaxis(values, 1, 0), level))
     low, high = (np.concatenate(limit) for limit in zip(*limits, strict=True))
     return _interval(statistic(games), low, high, games)
+
+
+def curves_by_game(returns: Any) -> dict[str, np.ndarray]:
+    """Learning curves as scores, game -> float64 [points, runs].
+
+    Args:
+        returns: float64 [runs, points] of one game, [runs, games, points], or game -> [runs, points].
+
+    Raises:
+        ValueError: they have another form, or what `mean` raises.
+    """
+    if not isinstance(returns, Mapping):
+        returns = np.asarray(returns, np.float64)
+        if returns.ndim not in (2, 3):
+            raise ValueError("curves are [runs, points], [runs, games, points], or game -> [runs, points]")
+        games = returns[:, None] if returns.ndim == 2 else returns
+        returns = {str(i): games[:, i] for i in range(games.shape[1])}
+    curves = {game: np.asarray(x, np.float64) for game, x in returns.items()}
+    if any(x.ndim != 2 for x in curves.values()) or len({x.shape[1] for x in curves.values()}) != 1:
+        raise ValueError("curves of all games and runs must have the same points; see at_equal_steps")
+    return by_game({game: x.T for game, x in curves.items()})
+
+
+def check_level(level: float) -> None:
+    """Raises ValueError if it is not between 0 and 1."""
+    if not 0 < level < 1:
+        raise ValueError(f"level={level}: must be between 0 and 1")
 
 
 def difference(statistic: Statistic) -> Statistic:
@@ -147,6 +173,8 @@ def _draw(games: Mapping[str, np.ndarray], repetitions: int, rng: np.random.Gene
 
 
 def _interval(point, low, high, *arms: Mapping[str, np.ndarray]) -> Interval:
-    if any(x.shape[-1] < 2 for arm in arms for x in arm.values()):
+    fewest = min(x.shape[-1] for arm in arms for x in arm.values())
+    kind = NONE if fewest < 2 else NARROW if fewest < ENOUGH else BOOTSTRAP
+    if kind == NONE:
         low, high = np.full_like(low, np.nan), np.full_like(high, np.nan)
-    return Interval(*(np.asarray(x, np.float64) for x in (point, low, high)))
+    return Interval(*(np.asarray(x, np.float64) for x in (point, low, high)), kind)

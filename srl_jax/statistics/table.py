@@ -8,13 +8,13 @@ import numpy as np
 from srl_jax.statistics.aggregates import (
     AGGREGATES,
     Scores,
-    Statistic,
     by_game,
     human_normalised,
     mean,
     probability_of_improvement,
 )
-from srl_jax.statistics.intervals import Interval, bootstrap, difference
+from srl_jax.statistics.estimates import estimate, estimate_difference
+from srl_jax.statistics.intervals import Interval
 
 
 def runs_text(scores: Scores) -> str:
@@ -36,11 +36,11 @@ def summary(
         arms: arm -> game -> raw scores [runs].
         baseline: the arm that all others are compared with; None for none.
         seed: of the draws; every row starts from it.
-        **how: repetitions and level, see `bootstrap`.
+        **how: repetitions and level, see `estimate`.
 
     Returns:
         Rows with the keys arm, against (the baseline, or None), game (None: over all games that every arm
-        has), statistic, point, low, high (None: no interval, from a single run), runs (their number in
+        has), statistic, point, low, high (None: no interval), kind (see `Interval`), runs (their number in
         words). Statistics: "return" of each game, unnormalised; `AGGREGATES` of human-normalised scores;
         against the baseline "return_difference" of each game, "mean_difference" and so on, the arm's minus
         the baseline's, and "probability_of_improvement". There is no row for what the arms do not share.
@@ -56,34 +56,33 @@ def summary(
     normal = {a: {g: human_normalised(g, scores[g]) for g in games} for a, scores in arms.items()}
     rows = []
 
-    def add(name: str, statistic: Statistic, of: str, game: str | None, *scores: Scores) -> None:
-        found = bootstrap(statistic, *scores, seed=seed, **how)
-        numbers = [None if np.isnan(value) else float(value) for value in found]
+    def add(name: str, found: Interval, of: str, game: str | None, *scores: Scores) -> None:
+        numbers = [None if np.isnan(value) else float(value) for value in found[:3]]
         runs = " against ".join(dict.fromkeys(runs_text(arm) for arm in scores))
         against = baseline if len(scores) > 1 else None
         row = {"arm": of, "against": against, "game": game, "statistic": name}
-        rows.append(row | dict(zip(Interval._fields, numbers, strict=True)) | {"runs": runs})
+        values = dict(zip(Interval._fields, [*numbers, found.kind], strict=True))
+        rows.append(row | values | {"runs": runs})
 
+    how["seed"] = seed
     for arm, scores in arms.items():
         theirs = {} if arm == baseline or baseline is None else arms[baseline]
-        for game, returns in scores.items():
-            add("return", mean, arm, game, {game: returns})
+        for game in scores:
+            mine = {game: scores[game]}
+            add("return", estimate(mean, mine, **how), arm, game, mine)
             if game in theirs:
-                pair = {game: returns}, {game: theirs[game]}
-                add("return_difference", difference(mean), arm, game, *pair)
+                base = {game: theirs[game]}
+                add("return_difference", estimate_difference(mine, base, **how), arm, game, mine, base)
         if not games:
             continue
+        mine = normal[arm]
         for name, statistic in AGGREGATES.items():
-            add(name, statistic, arm, None, normal[arm])
+            add(name, estimate(statistic, mine, **how), arm, None, mine)
         if theirs:
+            base = normal[baseline]
             for name, statistic in AGGREGATES.items():
-                add(f"{name}_difference", difference(statistic), arm, None, normal[arm], normal[baseline])
-            add(
-                "probability_of_improvement",
-                probability_of_improvement,
-                arm,
-                None,
-                normal[arm],
-                normal[baseline],
-            )
+                found = estimate_difference(mine, base, statistic, **how)
+                add(f"{name}_difference", found, arm, None, mine, base)
+            found = estimate(probability_of_improvement, mine, base, **how)
+            add("probability_of_improvement", found, arm, None, mine, base)
     return rows
