@@ -4,8 +4,9 @@
 
 Every arm of the figure that has not been run yet is run, each seed as a process of its own that can be killed
 and gone on with; then the figure is drawn: mean evaluation return over seeds with 95 % intervals of the
-stratified bootstrap, against env steps, over the thesis' own curve where there is one. FIGURE.png and
-FIGURE.json (its numbers) go to OUT/figures. Runs lie in OUT/GAME/ARM/seedN and are shared by all figures.
+stratified bootstrap, against env steps, over the thesis' own curve where there is one, with lines for what a
+random and a no-op policy score. FIGURE.png and FIGURE.json (its numbers) go to OUT/figures. Runs lie in
+OUT/GAME/ARM/seedN and are shared by all figures.
 Every flag of experiments.train that says something of a run goes to all of them.
 """
 
@@ -24,7 +25,7 @@ from experiments.collect import RunData, comparable, steps_and_returns
 from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
 from srl_jax import statistics
 from srl_jax.config import Config
-from srl_jax.data import published
+from srl_jax.data import published, reference_policies
 from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
@@ -106,6 +107,10 @@ def evaluated(
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
             entry["arms"][name] = values
         config = next(iter(members.values()))[0].config
+        entry["policies"] = {
+            name: {"mean": row.return_mean, "differs": row.differs_from(config), "source": row.source}
+            for name, row in reference_policies(game).items()
+        }
         entry["published"] = [level._asdict() for level in published_levels(game, methods, config, until)]
         result["games"][game] = entry
     return result
@@ -169,7 +174,9 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
                 limits = (np.array(values[key], float) for key in ("mean", "low", "high"))
                 seeds, thesis = len(values["seeds"]), arm.thesis_curve(game)
                 lines.append(curves.Line(arm.name, values["env_steps"], *limits, seeds, thesis))
-        panels.append(curves.Panel(game, lines, [curves.Level(**level) for level in entry["published"]]))
+        policies = [curves.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
+        levels = [curves.Level(**level) for level in entry["published"]]
+        panels.append(curves.Panel(game, lines, levels, policies))
     note = "bands: 95 % stratified bootstrap over seeds"
     if numbers["forced"]:
         note += "; PROTOCOLS DIFFER between runs"
@@ -207,7 +214,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     sweep.define_launcher_flags(values)
     flags.DEFINE_string(
         "published",
-        "Random,Human,Dopamine Rainbow",
+        "Human,Dopamine Rainbow",
         "published results to draw as lines where a game has them, names with commas, as in "
         "srl_jax/data/published.csv",
         flag_values=values,

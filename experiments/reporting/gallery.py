@@ -13,7 +13,7 @@ from experiments.reporting import diagnostics, numbers, pictures
 from experiments.reporting.contents import Content, Report, run_name
 from experiments.reporting.markup import Markup, breakable, details, figure, listed, plural, tag
 from srl_jax import statistics
-from srl_jax.data import published
+from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
@@ -58,24 +58,25 @@ def learning_curves(report: Report) -> Content:
     for game, comparison in report.comparisons.items():
         if comparison is None:
             continue
-        levels = [("random policy, published", x.score) for x in published(game) if x.method == "Random"]
+        policies = {name: row.return_mean for name, row in reference_policies(game).items()}
         arms = [arm for arm in report.arms if arm in comparison.returns]
         curves = {}
         for arm in arms:
             interval = statistics.curve_interval(comparison.returns[arm])
             curves[report.arms.index(arm)] = pictures.Curve(comparison.steps, *interval)
-        limits = _limits_of(curves.values(), levels)
+        limits = _limits_of(curves.values(), policies.values())
         for group in groups(arms, report.baseline):
             lines = {report.arms.index(arm): curves[report.arms.index(arm)] for arm in group}
             picture = pictures.curves(
-                game, lines, size=(5.4, 3.5), label="mean return", levels=levels, limits=limits
+                game, lines, size=(5.4, 3.5), label="mean return", policies=policies, limits=limits
             )
             caption = _legend(report, {arm: len(comparison.returns[arm]) for arm in group})
             drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))
     if not drawn:
         return None
     note = (
-        "Mean evaluation return, and its 95 % interval over seeds, at env steps that all runs of a game have."
+        "Mean evaluation return, and its 95 % interval over seeds, at env steps that all runs of a game "
+        "have. Lines across: policies that learn nothing."
     )
     return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
 
@@ -107,9 +108,9 @@ def profiles(report: Report) -> Content:
     return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
 
 
-def _limits_of(curves: Iterable[pictures.Curve], levels: Sequence[tuple[str, float]]) -> tuple[float, float]:
+def _limits_of(curves: Iterable[pictures.Curve], levels: Iterable[float]) -> tuple[float, float]:
     """Of the vertical axis of all pictures of a game, so that they can be compared."""
-    values = np.concatenate([*(np.concatenate(curve[1:]) for curve in curves), [y for _, y in levels]])
+    values = np.concatenate([*(np.concatenate(curve[1:]) for curve in curves), [*levels]])
     low, high = np.nanmin(values), np.nanmax(values)
     room = 0.05 * (high - low) or 0.5
     return float(low - room), float(high + room)

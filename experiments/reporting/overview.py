@@ -11,6 +11,7 @@ from experiments.reporting.contents import TELLING, Content, Report, limits, run
 from experiments.reporting.markup import Markup, details, figure, listed, number, plural, table, tag
 from experiments.reporting.numbers import Row
 from experiments.reporting.tables import interval_of, summary_of
+from srl_jax.data import reference_policies
 from srl_jax.statistics import Interval
 
 COVERAGE = {2: 67, 3: 80, 4: 85, 5: 88, 7: 90, 10: 92, 20: 94}
@@ -108,6 +109,9 @@ def what_it_says(report: Report) -> Content:
         for what, of in (("Return at the end", "final"), ("Return averaged over env steps", "area")):
             found = {arm: getattr(row, f"{of}_difference") for arm, row in rows.items()}
             items.append(_sentence(report, what, getattr(base, of), found, game))
+        if policies := reference_policies(game):
+            told = [f"a {name} policy has {number(x.return_mean)}" for name, x in policies.items()]
+            items.append(tag("li", f"For comparison, {listed(told)}."))
         parts.append(tag("ul", items))
         pictured += _picture(report, game, rows)
     parts += _over_games(report)

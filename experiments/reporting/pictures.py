@@ -177,7 +177,7 @@ def curves(
     size: tuple[float, float] = (3.4, 2.3),
     label: str = "",
     across: str = plots.STEPS_LABEL,
-    levels: Sequence[tuple[str, float]] = (),
+    policies: Mapping[str, float] | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Picture:
     """A picture of one number against another, mostly env steps; which line is whose is said beside it.
@@ -188,7 +188,7 @@ def curves(
         size: width and height in inches.
         label: of the vertical axis.
         across: of the horizontal axis; numbers are abbreviated where it is env steps.
-        levels: names and heights of dotted lines across.
+        policies: of reference policies, see `plots.levels`.
         limits: of the vertical axis; None for what the lines need.
     """
     small = size[0] < 4
@@ -202,12 +202,6 @@ def curves(
                 axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
             width, marker = 1.5 if small else 1.8, "o" if len(curve.at) == 1 else ""
             axes.plot(curve.at, curve.point, line, color=colour, linewidth=width, marker=marker, markersize=3)
-        for name, height in levels:
-            axes.axhline(height, color="#888888", linestyle=":", linewidth=1)
-            axes.annotate(
-                name, (0.01, height), xycoords=axes.get_yaxis_transform(), xytext=(0, 1.5),
-                textcoords="offset points", fontsize=7, color="#555555", parse_math=False,
-            )  # fmt: skip
         axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
         (plots.count_axis if across == plots.STEPS_LABEL else plots.plain)(axes)
         axes.tick_params(labelsize=7 if small else 9)
@@ -215,6 +209,7 @@ def curves(
         axes.set_ylabel(label, fontsize=9)
         if limits is not None:
             axes.set_ylim(*limits)
+        plots.levels(axes, policies or {})
         plots.save(figure, path)
 
     return drawn(draw)
