@@ -15,6 +15,9 @@ VERSION := $(shell $(PYTHON) -c 'import sys; print("%d.%d" % sys.version_info[:2
 # Named after the version, so that another PYTHON= makes another environment.
 STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 
+# A flag and its value, unless ARGS gives that flag: none may be given twice.
+unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
+
 .DEFAULT_GOAL := help
 .PHONY: help install test train lint soak bench bench-gpu bench-install
 
@@ -41,8 +44,8 @@ test: install ## run all tests
 	@$(VENV)/bin/python -m pytest -q $(ARGS)
 
 train: install ## train on Pong for about three minutes (two cores), into a new directory under runs/
-	@$(VENV)/bin/python -m experiments.train --preset=demo \
-		--out=runs/demo-$$(date +%Y%m%d-%H%M%S) $(ARGS)
+	@$(VENV)/bin/python -m experiments.train $(call unless,--preset=,demo) \
+		$(call unless,--out=,runs/demo-$$(date +%Y%m%d-%H%M%S)) $(ARGS)
 
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .

@@ -34,10 +34,10 @@ class Line(NamedTuple):
 
 
 class Level(NamedTuple):
-    """A published result: a horizontal line.
+    """A published result, or what a reference policy scores: a horizontal line.
 
     Attributes:
-        method: whose, at the line.
+        method: whose, at the line; of a policy "random" or "no-op".
         score: where it is.
         differs: what differs from the runs that are drawn, below the figure; may be empty.
     """
@@ -53,6 +53,7 @@ class Panel(NamedTuple):
     title: str
     lines: Sequence[Line]
     levels: Sequence[Level] = ()
+    policies: Sequence[Level] = ()
 
 
 def comparison(
@@ -98,13 +99,15 @@ def comparison(
                     at, np.interp(at, steps, returns), "--", color=colour, linewidth=1.2, alpha=0.8
                 )
                 handles["the thesis' own, one run each"] = dashed
-        _levels(axes, panel.levels, end)
         plots.count_axis(axes)
         axes.set_xlim(0, end)
-        if axes.lines:
-            shown = np.concatenate([np.asarray(line.get_ydata(), float) for line in axes.lines])
+        levels = [x.score for x in (*panel.levels, *panel.policies)]
+        shown = np.concatenate([*(line.get_ydata() for line in axes.lines), levels])
+        if len(shown):
             bands = np.concatenate([limit for line in panel.lines for limit in (line.low, line.high)])
             axes.set_ylim(*plots.heights(shown, bands))
+        others = [(x.method, x.score) for x in panel.levels]
+        plots.levels(axes, {x.method: x.score for x in panel.policies}, others)
     known = "the thesis' own, one run each"
     if known in handles:  # last, and in no arm's colour
         from matplotlib.lines import Line2D
@@ -113,7 +116,8 @@ def comparison(
         handles[known] = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
     notes = [note] if note else []
     for panel in panels:
-        notes += [f"{panel.title}, {x.method}, {x.score:g}: {x.differs}" for x in panel.levels if x.differs]
+        shown = [x._replace(method=f"{x.method} policy") for x in panel.policies] + list(panel.levels)
+        notes += [f"{panel.title}, {x.method}, {x.score:g}: {x.differs}" for x in shown if x.differs]
     characters = int(17 * width * columns)
     notes = [line for text in notes for line in textwrap.wrap(text, characters, subsequent_indent="    ")]
     legend = figure.legend(
@@ -136,19 +140,3 @@ def _seeds(panels: Sequence[Panel], label: str) -> str:
     counts = sorted({line.seeds for panel in panels for line in panel.lines if line.label == label})
     number = " or ".join(map(str, counts))
     return f"{number} seed{'' if counts == [1] else 's'}"
-
-
-def _levels(axes, levels: Sequence[Level], end: float) -> None:
-    """Dotted lines, their names side by side along them, so that near ones can be told apart."""
-    for i, level in enumerate(levels):
-        axes.axhline(level.score, color="#888888", linestyle=":", linewidth=1)
-        text = axes.annotate(
-            level.method,
-            (end * (0.01 + i / len(levels)), level.score),
-            xytext=(0, 1.5),
-            textcoords="offset points",
-            fontsize=6.5,
-            color="#555555",
-            parse_math=False,
-        )
-        text.set_in_layout(False)

@@ -14,7 +14,7 @@ from absl import flags
 from experiments import diagnostic_plots, plots
 from experiments import flags as config_flags
 from srl_jax.config import Config
-from srl_jax.data import thesis_curve
+from srl_jax.data import reference_policies, thesis_curve
 from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import KINDS, read_metrics
@@ -55,9 +55,9 @@ def draw_run(
     rows = read_rows(run / "metrics.jsonl")
     figures = run / "figures"
     title = f"{config.game}, {config.mode}, {config.encoder.partition(':')[0]}, seed {config.seed}"
-    curve = plots.learning_curve(
-        rows, figures / "learning_curve.png", title, _reference(config, thesis) if thesis else None
-    )
+    reference = _reference(config, thesis) if thesis else None
+    policies = {name: row.return_mean for name, row in reference_policies(config.game).items()}
+    curve = plots.learning_curve(rows, figures / "learning_curve.png", title, reference, policies)
     written = [curve, plots.losses(rows, figures / "losses.png")]
     written.append(diagnostic_plots.diagnostics(rows, figures / "diagnostics.png", title))
     written.append(diagnostic_plots.drift_matrix(rows, figures / "drift.png", title))

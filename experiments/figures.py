@@ -4,8 +4,9 @@
 
 Every arm of the figure that has not been run yet is run, each seed as a process of its own that can be killed
 and gone on with; then the figure is drawn: mean evaluation return over seeds with 95 % t intervals at each
-point, against env steps, over the thesis' own curve where there is one. FIGURE.png and
-FIGURE.json (its numbers) go to OUT/figures. Runs lie in OUT/GAME/ARM/seedN and are shared by all figures.
+point, against env steps, over the thesis' own curve where there is one, with lines for what a random and a
+no-op policy score. FIGURE.png and FIGURE.json (its numbers) go to OUT/figures. Runs lie in OUT/GAME/ARM/seedN
+and are shared by all figures.
 Every flag of experiments.train that says something of a run goes to all of them.
 """
 
@@ -25,7 +26,7 @@ from experiments.colours import styles
 from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
 from srl_jax import statistics
 from srl_jax.config import Config
-from srl_jax.data import published
+from srl_jax.data import published, reference_policies
 from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
@@ -113,6 +114,10 @@ def evaluated(
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
             entry["arms"][name] = values
         config = next(iter(members.values()))[0].config
+        entry["policies"] = {
+            name: {"mean": row.return_mean, "differs": row.differs_from(config), "source": row.source}
+            for name, row in reference_policies(game).items()
+        }
         entry["published"] = [level._asdict() for level in published_levels(game, methods, config, until)]
         result["games"][game] = entry
     return result
@@ -179,10 +184,14 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
                 limits = (np.array(values[key], float) for key in ("mean", "low", "high"))
                 seeds, thesis = len(values["seeds"]), arm.thesis_curve(game)
                 lines.append(curves.Line(arm.name, values["env_steps"], *limits, seeds, thesis))
-        panels.append(curves.Panel(game, lines, [curves.Level(**level) for level in entry["published"]]))
+        policies = [curves.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
+        levels = [curves.Level(**level) for level in entry["published"]]
+        panels.append(curves.Panel(game, lines, levels, policies))
     kinds = {arm["kind"] for entry in numbers["games"].values() for arm in entry["arms"].values()}
     kinds = ", ".join(sorted(kinds - {statistics.NONE}))
     note = f"bands: 95 % intervals over seeds at each point, {kinds}" if kinds else "single seeds: no bands"
+    if any(panel.policies for panel in panels):
+        note += "; dash-dotted: policies that learn nothing"
     if numbers["forced"]:
         note += "; PROTOCOLS DIFFER between runs"
     looks = {arm: tuple(style) for arm, style in numbers["styles"].items()}
@@ -218,7 +227,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     sweep.define_launcher_flags(values)
     flags.DEFINE_string(
         "published",
-        "Random,Human,Dopamine Rainbow",
+        "Human,Dopamine Rainbow",
         "published results to draw as lines where a game has them, names with commas, as in "
         "srl_jax/data/published.csv",
         flag_values=values,

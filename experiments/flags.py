@@ -8,7 +8,7 @@ import functools
 import logging
 import os
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -252,16 +252,35 @@ def parse(
         rest = values(argv)
         if positional and len(rest) > 1 and not values[positional].present:
             values[positional].parse(rest.pop(1))
-            values[positional].present += 1
     except flags.UnrecognizedFlagError as error:
         near = difflib.get_close_matches(error.flagname, list(values), n=1, cutoff=0.6)
         suggestion = f"did you mean --{near[0]}? " if near else ""
         fail(f"--{error.flagname}: no such flag; {suggestion}--helpfull lists them all")
     except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
         fail(str(error).removeprefix("flag "))
+    for name in values:
+        flag = values[name]
+        if flag.present > 1 and not isinstance(flag, flags.MultiFlag):  # absl takes the last one
+            hint = "separate values with commas" if isinstance(flag.value, list) else "give it once"
+            fail(f"--{name}: given {flag.present} times; {hint}")
     if len(rest) > 1:
         fail(f"unexpected argument {rest[1]!r}: write every option as --name=value; see --help")
     return rest
+
+
+def last_of_each(arguments: Iterable[str]) -> tuple[str, ...]:
+    """A command line less each flag that a later one of its name replaces; --objective may be repeated.
+
+    For programs that add flags to others: `parse` refuses one that is given twice.
+    """
+    arguments = tuple(arguments)
+    names = [text.partition("=")[0] for text in arguments]
+    repeated = {f"--{info.flag or name}" for name, info in INFOS.items() if info.kind is tuple}
+    return tuple(
+        text
+        for i, (name, text) in enumerate(zip(names, arguments, strict=True))
+        if name in repeated or not name.startswith("--") or name not in names[i + 1 :]
+    )
 
 
 def guarded(main: Callable[[list[str]], Any]) -> Callable[[list[str]], Any]:

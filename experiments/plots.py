@@ -16,6 +16,8 @@ STEPS_LABEL = "env steps (4 frames each)"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette: distinguishable to colour-blind readers."""
 MAX_EXAMPLES = 6
+NEAR = 0.02
+"""Of an axis: reference policies that are as near to each other as that share a line."""
 
 
 def available() -> bool:
@@ -28,6 +30,7 @@ def learning_curve(
     path: str | os.PathLike,
     title: str,
     reference: Sequence[tuple[str, Sequence[float], Sequence[float]]] | None = None,
+    policies: Mapping[str, float] | None = None,
 ) -> Path | None:
     """Draws the mean evaluation return, and the worst to the best game, against env steps.
 
@@ -37,6 +40,7 @@ def learning_curve(
         title: of the figure.
         reference: other curves, (label, env steps, mean returns) each, drawn dashed and only as far
             as the run goes: curves are compared at equal steps.
+        policies: see `levels`.
 
     Returns:
         The path, or None if there is no evaluation to draw (then nothing is written).
@@ -76,6 +80,7 @@ def learning_curve(
     count_axis(axes)
     if end == 0:  # evaluated before training only: keep the axis from counting in thousandths
         axes.set_xlim(-1, 1)
+    levels(axes, policies or {})
     axes.legend(loc="best", fontsize=8, framealpha=0.8)
     return save(figure, path)
 
@@ -265,6 +270,40 @@ def plain(axes) -> None:
     """A light grid, no box."""
     axes.grid(alpha=0.25, linewidth=0.6)
     axes.spines[["top", "right"]].set_visible(False)
+
+
+def levels(axes, policies: Mapping[str, float], others: Sequence[tuple[str, float]] = ()) -> None:
+    """Draws horizontal lines, their names side by side along them, so that near ones can be told apart.
+
+    Args:
+        axes: with everything else in it.
+        policies: name -> mean return of policies that learn nothing, dash-dotted.
+        others: (name, height), dotted.
+    """
+    from matplotlib.patheffects import Normal, Stroke
+
+    lines = [(name, height, {"linestyle": ":", "linewidth": 1}) for name, height in others]
+    heights = [*axes.get_ylim(), *policies.values(), *(height for _, height in others)]
+    thin = {"linestyle": "-.", "linewidth": 0.8}
+    if len(policies) > 1 and np.ptp(list(policies.values())) <= NEAR * np.ptp(heights):
+        lines.append((", ".join(policies), float(np.mean(list(policies.values()))), thin))
+    else:
+        lines += [(f"{name} policy", height, thin) for name, height in policies.items()]
+    for i, (name, height, form) in enumerate(lines):
+        axes.axhline(height, color="#888888", **form)
+        text = axes.annotate(
+            name,
+            ((i + 1) / len(lines) - 0.01, height),  # the last one at the right, where curves have left it
+            xycoords=axes.get_yaxis_transform(),
+            horizontalalignment="right",
+            path_effects=[Stroke(linewidth=1.5, foreground="white"), Normal()],
+            xytext=(0, 1.5),
+            textcoords="offset points",
+            fontsize=6.5,
+            color="#555555",
+            parse_math=False,
+        )
+        text.set_in_layout(False)
 
 
 def log_axis(axes, span: float) -> None:

@@ -34,6 +34,7 @@ def evaluate(
     max_steps: int = 27_000,
     record: int = 0,
     stop: Callable[[], bool] = lambda: False,
+    told: Callable[[int, int], None] = lambda steps, games: None,
 ) -> Evaluation | None:
     """Plays full games: a lost life ends nothing, rewards are the game's own.
 
@@ -49,6 +50,7 @@ def evaluate(
         max_steps: env steps after which a game is cut, its score counted as it stands.
         record: frames of the first environment to keep at most.
         stop: asked before every step; once it says so, the games are left and there is no result.
+        told: after every step, how many each environment has taken and how many games have been played.
     """
     number = env.num_envs
     shape = env.single_observation_space.shape
@@ -79,6 +81,7 @@ def evaluate(
             stacks.begin(frames, over)
             if over[0] and len(recorded) < record and len(scores[0]) < share[0]:
                 recorded.append(frames[0])
+        told(step, sum(map(min, map(len, scores), share)))
     played = [scores[i % number][i // number] for i in range(games)]
     return Evaluation(
         returns=[r for r, _ in played],

@@ -182,6 +182,10 @@ BAD = [
     (["--encoder=tiny:features=100000"], "--encoder=tiny:features=100000", "at most 65536"),
     (["--out=a\nb"], "--out=a b", "'\\n'; name it with printable ones"),
     (["--game=\x1b[31m"], "--game=\\x1b[31m", "valid: Alien"),
+    (["--game=Pong", "--game=Catch"], "--game: given 2 times", "give it once"),
+    (["--steps=5", "--steps=5", "--steps=5"], "--steps: given 3 times", "give it once"),
+    (["--reward_clip", "--noreward_clip"], "--reward_clip: given 2 times", "give it once"),
+    (["--preset=demo", "--preset=demo"], "--preset: given 2 times", "give it once"),
     (["--mode=" + "x" * 10_000], "--mode=xxx", " [...] "),
 ]
 
@@ -190,7 +194,7 @@ BAD = [
 def test_bad_input_is_one_line_and_status_2(arguments, flag, choice, tmp_path, capsys, loop):
     out = tmp_path / "runs" / "a"
     with pytest.raises(SystemExit) as ended:
-        _train(f"--out={out}", *arguments)
+        _train(*([] if any("--out=" in text for text in arguments) else [f"--out={out}"]), *arguments)
     assert ended.value.code == 2
     printed = capsys.readouterr()
     assert printed.out == ""
@@ -198,6 +202,34 @@ def test_bad_input_is_one_line_and_status_2(arguments, flag, choice, tmp_path, c
     assert flag in printed.err and choice in printed.err
     assert list(tmp_path.iterdir()) == []
     assert loop.calls == []
+
+
+def test_a_later_flag_of_a_name_replaces_an_earlier_one():
+    given = ("--a=1", "--objective=x", "--b=2", "--c", "--objective=y", "--a=3", "--b=", "run")
+    left = ("--objective=x", "--c", "--objective=y", "--a=3", "--b=", "run")
+    assert config_flags.last_of_each(given) == left
+
+
+@pytest.mark.parametrize(
+    ("program", "flag", "hint"),
+    [
+        ("draw", "run", "give it once"),
+        ("evaluate", "games", "give it once"),
+        ("report", "runs", "give it once"),
+        ("sweep", "lr_rl", "give it once"),
+        ("sweep", "presets", "separate values with commas"),
+        ("figures", "games", "separate values with commas"),
+        ("reference_policies", "games", "separate values with commas"),
+        ("soak", "only", "separate values with commas"),
+        ("benchmarks.bench", "rounds", "give it once"),
+    ],
+)
+def test_a_flag_that_means_one_value_is_refused_twice(program, flag, hint):
+    # A process each: that entry points parse in one place is the point.
+    value = "Catch" if flag == "games" and program != "evaluate" else "1"
+    done = _python("-m", f"experiments.{program}", f"--{flag}={value}", f"--{flag}={value}")
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr == f"error: --{flag}: given 2 times; {hint}\n"
 
 
 def _refused(capsys, *arguments):

@@ -62,6 +62,13 @@ def test_a_band_that_is_very_wide_does_not_make_the_lines_flat(drawn, tmp_path):
     assert drawn[0].axes[0].get_ylim() == pytest.approx((-2.3, 4.3))
 
 
+def test_policies_and_published_results_are_within_the_axis(drawn, tmp_path):
+    line = curves.Line("a", STEPS, [0.0, 1.0, 2.0], *[np.full(3, np.nan)] * 2, 1)
+    panel = curves.Panel("Pong", [line], [curves.Level("Human", 20.0)], [curves.Level("random", -10.0)])
+    curves.comparison([panel], tmp_path / "x.png", "title")
+    assert drawn[0].axes[0].get_ylim() == pytest.approx((-11.5, 21.5))  # 5 % of the thirty to either side
+
+
 def test_arms_look_as_they_are_told_to(drawn, tmp_path):
     looks = {"a": ("#112233", "-"), "b": ("#112233", ":")}
     panel = _panel("Pong", a=(1.0, None), b=(2.0, None))
@@ -74,3 +81,24 @@ def test_the_same_numbers_give_the_same_file(tmp_path):
     panels = [_panel("Pong", a=(1.0, None))]
     files = [curves.comparison(panels, tmp_path / name, "title", "note") for name in ("x.png", "y.png")]
     assert files[0].read_bytes() == files[1].read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("noop", "lines"),
+    [
+        # The axis spans 0 to 10, and a margin of 5 % on both sides: 2 % of it are 0.22.
+        (0.5, {"random policy": 0.0, "no-op policy": 0.5}),
+        (0.2, {"random, no-op": 0.1}),
+        (None, {"random policy": 0.0}),
+    ],
+)
+def test_policies_that_learn_nothing_are_lines_and_near_ones_share_one(drawn, tmp_path, noop, lines):
+    line = curves.Line("a", STEPS, np.array([0.0, 5.0, 10.0]), *[np.full(3, np.nan)] * 2, 1)
+    policies = [curves.Level("random", 0.0, "sticky actions 0 (here 0.25)")]
+    policies += [] if noop is None else [curves.Level("no-op", noop)]
+    curves.comparison([curves.Panel("Pong", [line], [], policies)], tmp_path / "x.png", "title")
+    (axes,) = drawn[0].axes
+    drawn_lines = [x.get_ydata()[0] for x in axes.lines if x.get_linestyle() == "-."]
+    assert dict(zip([x.get_text() for x in axes.texts], drawn_lines, strict=True)) == lines
+    (legend,) = drawn[0].legends
+    assert "Pong, random policy, 0: sticky actions 0 (here 0.25)" in legend.get_title().get_text()

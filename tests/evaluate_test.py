@@ -130,3 +130,12 @@ def test_same_seed_same_games():
     np.testing.assert_array_equal(first.frames, again.frames)
     assert not np.array_equal(first.frames, other.frames)
     env.close()
+
+
+def test_progress_is_told_after_every_step():
+    # Environment 0 plays two games of one step that count, and then others; environment 1 one of three steps.
+    told = []
+    play(
+        Scripted([[[7.0]], [[1.0, 1.0, 1.0]]]), games=3, told=lambda steps, games: told.append((steps, games))
+    )
+    assert told == [(1, 1), (2, 2), (3, 3)]

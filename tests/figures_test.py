@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import collect, figures
+from experiments import collect, curves, figures
 from experiments import flags as config_flags
 from experiments.arms import FIGURES, Figure, FigureArm
 from experiments.reporting.numbers import compare, rows
 from srl_jax.config import Config
+from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from tests.helpers import write_run
 
@@ -220,6 +221,25 @@ def test_published_results_say_what_differs():
     assert "env steps 250,000 (here 260,000)" in rainbow.differs and "sticky actions 0.25" in rainbow.differs
     assert "training score" in rainbow.differs
     assert figures.published_levels("Catch", ["Human"], config, 100) == []
+
+
+def test_policies_that_learn_nothing_are_in_the_json_and_drawn(runs, monkeypatch):
+    pytest.importorskip("matplotlib")
+    numbers = json.loads(json.dumps(_evaluated(runs)))
+    policies = numbers["games"]["Catch"]["policies"]
+    known = reference_policies("Catch")
+    assert {name: x["mean"] for name, x in policies.items()} == {
+        name: row.return_mean for name, row in known.items()
+    }
+    assert all(x["source"].startswith("python -m experiments.") for x in policies.values())
+    assert all(x["differs"] == "" for x in policies.values())
+    given = []
+    monkeypatch.setattr(curves, "comparison", lambda *values: given.extend(values))
+    figures.draw(FIGURE, numbers, runs / "x.png")
+    panels, _, _, note, _ = given
+    assert "intervals over seeds at each point, Student's t; dash-dotted: policies that learn nothing" in note
+    levels = [(name, row.return_mean, "") for name, row in known.items()]
+    assert [tuple(level) for level in panels[0].policies] == levels
 
 
 def test_limits_of_a_single_seed_are_no_numbers():

@@ -55,6 +55,14 @@ def test_learning_curve_draws_means_and_cuts_the_reference_at_equal_steps(tmp_pa
     assert (band[:, 1].min(), band[:, 1].max()) == (-21, -11)
 
 
+def test_learning_curve_has_a_line_for_each_policy(tmp_path, drawn):
+    rows = [eval_row(steps, [float(steps)]) for steps in (0, 100)]
+    plots.learning_curve(rows, tmp_path / "curve.png", "x", policies={"random": -10.0, "no-op": 30.0})
+    (axes,) = drawn[0].axes
+    assert [text.get_text() for text in axes.texts] == ["random policy", "no-op policy"]
+    assert [line.get_ydata()[0] for line in axes.lines if line.get_linestyle() == "-."] == [-10.0, 30.0]
+
+
 def test_a_reference_shorter_than_the_run_is_not_extended(tmp_path, drawn):
     rows = [eval_row(steps, [1.0]) for steps in (0, 100)]
     plots.learning_curve(rows, tmp_path / "curve.png", "x", [("r", [0, 50], [2.0, 3.0])])

@@ -14,6 +14,7 @@ from experiments import plots, report
 from experiments.collect import RunData
 from experiments.reporting import browser
 from srl_jax.config import Config
+from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 
 pytestmark = pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
@@ -181,6 +182,19 @@ def test_numbers_by_hand(page):
     assert over["joint"][4:] == ["0.00 (no interval)", "0.75 [0.50, 1.00] too narrow"]
 
 
+def test_policies_that_learn_nothing_are_beside_the_arms(page):
+    rows = page.table("Statistics of Catch")
+    for name, policy in reference_policies("Catch").items():
+        score = f"{policy.return_mean:.2f}".replace("-", "−")
+        cells = rows[f"{name} policy"]
+        assert cells == ["–", f"{score} (5,000 games)", "–", f"{score} (5,000 games)", "–", "–"]
+        assert f"a {name} policy has {score}" in page.text
+        # A miss is 0 and a catch 1: half of what is above -1. One game has one mean, median and so on.
+        normal = (policy.return_mean + 1) / 2
+        over = page.table("The return averaged over env steps, over games")[f"{name} policy"]
+        assert over == ["–", *[f"{normal:.2f}"] * 3, f"{1 - normal:.2f}", "–"]
+
+
 def test_two_seeds_tell_little(page):
     assert "rl has 0.31 [−2.07, 2.69]. No arm differs from it by Welch's t test at 5 %." in page.text
     assert "Above it" not in page.text and "▲" not in "".join(page.table("Statistics of Catch")["joint"])
@@ -271,7 +285,7 @@ def test_a_page_of_runs_of_before(tmp_path):
     write_run(tmp_path / "pretrain/seed0", mode="pretrain")
     page = Page(build(tmp_path, media=False))
     assert "These runs have no diagnostics" in page.text and "no_media" in page.text
-    assert list(page.table("Statistics of Catch")) == ["arm", "a"]
+    assert list(page.table("Statistics of Catch")) == ["arm", "a", "random policy", "no-op policy"]
     assert "Catch / b / seed 0: 200 of 200 env steps" in page.text  # it lacks evaluations
     assert [a["alt"] for tag, a in page.attributes if tag == "img"] == ["Catch: learning curves"]
     assert "pretrain" in page.table("Settings on Catch")["field"]

@@ -13,7 +13,7 @@ from experiments.reporting import diagnostics, numbers, pictures
 from experiments.reporting.contents import Content, Report, run_name
 from experiments.reporting.markup import Markup, breakable, details, figure, listed, plural, tag
 from srl_jax import statistics
-from srl_jax.data import published
+from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
@@ -58,17 +58,17 @@ def learning_curves(report: Report) -> Content:
     for game, comparison in report.comparisons.items():
         if comparison is None:
             continue
-        levels = [("random policy, published", x.score) for x in published(game) if x.method == "Random"]
+        policies = {name: row.return_mean for name, row in reference_policies(game).items()}
         arms = [arm for arm in report.arms if arm in comparison.returns]
         curves = {}
         for arm in arms:
             interval = statistics.curve_interval(comparison.returns[arm])
             curves[arm] = pictures.Curve(comparison.steps, *interval[:3])
-        limits = pictures.heights(list(curves.values()), levels)  # the same in all pictures of a game
+        limits = pictures.heights(curves.values(), policies.values())  # the same in all pictures of a game
         for group in groups(arms, report.baseline):
             lines = [(report.styles[arm], curves[arm]) for arm in group]
             picture = pictures.curves(
-                game, lines, size=(5.4, 3.5), label="mean return", levels=levels, limits=limits
+                game, lines, size=(5.4, 3.5), label="mean return", policies=policies, limits=limits
             )
             caption = _legend(report, {arm: len(comparison.returns[arm]) for arm in group})
             drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))
@@ -76,7 +76,7 @@ def learning_curves(report: Report) -> Content:
         return None
     note = (
         "Mean evaluation return, and its 95 % t interval over seeds at each env step that all runs of a game "
-        "have."
+        "have. Lines across: policies that learn nothing."
     )
     return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
 

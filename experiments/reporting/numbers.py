@@ -14,6 +14,7 @@ from experiments.collect import RunData
 from experiments.presets import PRESETS
 from experiments.reporting import configs
 from srl_jax import statistics
+from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 from srl_jax.specs import LIMITS
@@ -110,6 +111,11 @@ def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None 
 def has_policy(run: RunData) -> bool:
     """Whether its mode trains a policy, which is then evaluated."""
     return MODES[run.config.mode].rl
+
+
+def config_of(runs: Sequence[RunData]) -> Config:
+    """Of the first run with a policy: the protocol of a game."""
+    return next(run.config for run in runs if has_policy(run))
 
 
 def reached_step(run: RunData) -> int:

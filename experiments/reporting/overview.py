@@ -11,6 +11,7 @@ from experiments.reporting.contents import Content, Report, difference_text, lim
 from experiments.reporting.markup import Markup, details, figure, listed, number, plural, table, tag
 from experiments.reporting.numbers import Row
 from experiments.reporting.tables import interval_of, summary_of
+from srl_jax.data import reference_policies
 from srl_jax.statistics import BOOTSTRAP, ENOUGH, NARROW, WELCH, Interval
 
 TESTS = {WELCH: "Welch's t test at 5 %", BOOTSTRAP: "a 95 % bootstrap interval that leaves out 0"}
@@ -107,6 +108,9 @@ def what_it_says(report: Report) -> Content:
         for what, of in (("Return at the end", "final"), ("Return averaged over env steps", "area")):
             found = {arm: getattr(row, f"{of}_difference") for arm, row in rows.items()}
             items.append(_sentence(report, what, getattr(base, of), found))
+        if policies := reference_policies(game):
+            told = [f"a {name} policy has {number(x.return_mean)}" for name, x in policies.items()]
+            items.append(tag("li", f"For comparison, {listed(told)}."))
         parts.append(tag("ul", items))
         pictured += _picture(report, game, rows)
     parts += _over_games(report)

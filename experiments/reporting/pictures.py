@@ -4,7 +4,7 @@ import base64
 import io
 import struct
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -163,9 +163,9 @@ def interval_curves(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | No
     return Curve(steps, *statistics.curve_interval(values)[:3])
 
 
-def heights(curves: Sequence[Curve], levels: Sequence[tuple[str, float]] = ()) -> tuple[float, float]:
-    """Limits of a vertical axis; see `plots.heights`."""
-    lines = np.concatenate([*(curve.point for curve in curves), [height for _, height in levels]])
+def heights(curves: Collection[Curve], levels: Collection[float] = ()) -> tuple[float, float]:
+    """Limits of a vertical axis, see `plots.heights`, that also show the levels."""
+    lines = np.concatenate([*(curve.point for curve in curves), [*levels]])
     return plots.heights(lines, np.concatenate([limit for curve in curves for limit in curve[2:]]))
 
 
@@ -176,7 +176,7 @@ def curves(
     size: tuple[float, float] = (3.4, 2.3),
     label: str = "",
     across: str = plots.STEPS_LABEL,
-    levels: Sequence[tuple[str, float]] = (),
+    policies: Mapping[str, float] | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Picture:
     """A picture of one number against another, mostly env steps; which line is whose is said beside it.
@@ -187,8 +187,8 @@ def curves(
         size: width and height in inches.
         label: of the vertical axis.
         across: of the horizontal axis; numbers are abbreviated where it is env steps.
-        levels: names and heights of dotted lines across.
-        limits: of the vertical axis; None for what `plots.heights` gives.
+        policies: of reference policies, see `plots.levels`.
+        limits: of the vertical axis; None for what `heights` gives.
     """
     small = size[0] < 4
 
@@ -200,18 +200,14 @@ def curves(
                 axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.15, linewidth=0)
             width, marker = 1.5 if small else 1.8, "o" if len(curve.at) == 1 else ""
             axes.plot(curve.at, curve.point, line, color=colour, linewidth=width, marker=marker, markersize=3)
-        for name, height in levels:
-            axes.axhline(height, color="#888888", linestyle=":", linewidth=1)
-            axes.annotate(
-                name, (0.01, height), xycoords=axes.get_yaxis_transform(), xytext=(0, 1.5),
-                textcoords="offset points", fontsize=7, color="#555555", parse_math=False,
-            )  # fmt: skip
         axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
         (plots.count_axis if across == plots.STEPS_LABEL else plots.plain)(axes)
         axes.tick_params(labelsize=7 if small else 9)
         axes.set_xlabel(across, fontsize=7.5 if small else 9)
         axes.set_ylabel(label, fontsize=9)
-        axes.set_ylim(*(limits or heights([curve for _, curve in lines], levels)))
+        levels = policies or {}
+        axes.set_ylim(*(limits or heights([curve for _, curve in lines], levels.values())))
+        plots.levels(axes, levels)
         plots.save(figure, path)
 
     return drawn(draw)

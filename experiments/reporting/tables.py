@@ -10,7 +10,7 @@ from experiments.reporting.contents import Content, Report, limits, side, signed
 from experiments.reporting.markup import Markup, details, number, plural, table, tag
 from experiments.reporting.numbers import Comparison, Row
 from srl_jax import statistics
-from srl_jax.data import Published, published
+from srl_jax.data import POLICIES, Published, ReferencePolicy, published, reference_policies
 from srl_jax.statistics import NARROW, Interval
 
 NEAR = 2.5
@@ -64,6 +64,12 @@ def _of_game(report: Report, game: str, comparison: Comparison) -> list:
             cells += [_cell(row.area), _difference(row.area_difference)]
             body.append(cells + ([_reaching(row, end)] if score is not None else []))
     notes = []
+    config = numbers.config_of(report.of(game))
+    for name, policy in reference_policies(game).items():
+        cell = _policy(policy)
+        body.append([f"{name} policy", "–", cell, "–", cell, "–"] + (["–"] if score is not None else []))
+        if differs := policy.differs_from(config):
+            notes.append(f"Of the {name} policy differs: {differs}. ")
     if (cut := comparison.cut_by) is not None:
         state = "ended" if numbers.finished(cut) else "has got to and is not finished"
         notes.append(f"Compared up to {end:,} env steps, where {cut.arm}, seed {cut.seed}, {state}. ")
@@ -79,6 +85,12 @@ def _of_game(report: Report, game: str, comparison: Comparison) -> list:
             f"The score to be reached{whose}; the median over seeds, never being more than any number."
         )
     return [table(head, body, f"Statistics of {game}"), tag("p", notes, class_="note")]
+
+
+def _policy(policy: ReferencePolicy) -> list:
+    """What a policy that learns nothing scores, at every env step."""
+    told = "published" if policy.episodes is None else plural(policy.episodes, "game")
+    return [number(policy.return_mean), " ", tag("span", f"({told})", class_="ci")]
 
 
 def _reaching(row: Row, end: int) -> list:
@@ -128,8 +140,9 @@ def _over_games(report: Report) -> list:
             body.append([arm, found[arm, "mean"]["runs"], *cells])
         if not body:
             continue
+        body += _policies_over_games(report, of)
         head, runs = ["arm", "runs", *AGGREGATES.values()], ""
-        if len({row[1] for row in body}) == 1:  # said once
+        if len({row[1] for row in body} - {"–"}) == 1:  # said once
             runs = f" ({body[0][1]})"
             head, body = [head[0], *head[2:]], [[row[0], *row[2:]] for row in body]
         parts.append(tag("p", f"{title}, human-normalised{runs}:"))
@@ -144,12 +157,27 @@ def _over_games(report: Report) -> list:
     return [*parts, tag("p", note, class_="note")]
 
 
+def _policies_over_games(report: Report, of: str) -> list:
+    """Rows of policies that learn nothing, where each game with runs of every arm has them."""
+    given = list(numbers.scores(report.comparisons, of, report.arms).values())
+    games = [game for game in report.comparisons if all(game in mine for mine in given)]
+    body = []
+    for name in POLICIES:
+        found = {game: reference_policies(game).get(name) for game in games}
+        if all(found.values()):
+            normal = {game: statistics.human_normalised(game, [x.return_mean]) for game, x in found.items()}
+            values = [statistics.AGGREGATES.get(key) for key in AGGREGATES]
+            cells = [number(float(statistic(normal))) if statistic else "–" for statistic in values]
+            body.append([f"{name} policy", "–", *cells])
+    return body
+
+
 def _published(report: Report, game: str, comparison: Comparison) -> list:
     results = published(game)
     if not results:
         return []
     end = int(comparison.steps[-1])
-    config = next(run.config for run in report.of(game) if numbers.has_policy(run))
+    config = numbers.config_of(report.of(game))
     seeds = max(len(x) for x in comparison.returns.values())
 
     def cells(result: Published) -> list:

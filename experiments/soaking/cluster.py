@@ -13,6 +13,7 @@ import sys
 import time
 from pathlib import Path
 
+from experiments.flags import last_of_each
 from experiments.soaking import Count, Say, sweeps
 from experiments.sweeping import manifest, states
 
@@ -29,7 +30,7 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
     if importlib.util.find_spec("ray") is None:
         return [Count("a Ray cluster", 0, 0, "skipped: Ray is not installed")]
     alone, spread = folder / "alone", folder / "spread"
-    flags = (*SWEEP, "--seeds=1", "--steps=1600") if short else SWEEP
+    flags = last_of_each((*SWEEP, "--seeds=1", "--steps=1600")) if short else SWEEP
     sweeps.left_alone(sweeps.command("sweep", alone, flags), say)
     detail = disturbed(spread, flags, 1 if short else WORKERS_KILLED, random.Random(0), say)
     return [sweeps.compared("a Ray cluster of two nodes", alone, spread, say, detail)]

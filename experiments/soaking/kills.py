@@ -17,6 +17,7 @@ import time
 from collections import Counter
 from pathlib import Path
 
+from experiments.flags import last_of_each
 from experiments.soaking import Count, Say
 from experiments.soaking.victim import POINTS
 from srl_jax.metrics import read_metrics, strip_wall
@@ -68,7 +69,7 @@ def flags_of(arm: str) -> tuple[str, ...]:
     """Of an arm: the run's flags; where one is given twice, the last one counts."""
     own = ARMS[arm]
     game = () if any(flag.startswith("--game=") for flag in own) else (f"--game={arm.split(',')[0]}",)
-    return (*SMALL, *game, *own)
+    return last_of_each((*SMALL, *game, *own))
 
 
 def soak(short: bool, folder: Path, say: Say) -> list[Count]:
@@ -78,7 +79,7 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
     draw = random.Random(SHORT_SEED if short else 0)
     environment = dict(os.environ, JAX_COMPILATION_CACHE_DIR=str(folder / "compiled"))
     environment |= {"JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0", "TF_CPP_MIN_LOG_LEVEL": "3"}
-    flags = {arm: flags_of(arm) + (SHORT if short else ()) for arm in arms}
+    flags = {arm: last_of_each(flags_of(arm) + (SHORT if short else ())) for arm in arms}
     alone = {}
     for i, arm in enumerate(arms):
         say(f"kills: {arm}, left alone")

@@ -17,7 +17,7 @@ from unittest import mock
 
 import numpy as np
 
-from experiments.flags import RL_OPTIONS
+from experiments.flags import RL_OPTIONS, last_of_each
 from srl_jax import checkpoint
 from srl_jax.config import INFOS, Config
 from srl_jax.specs import Info
@@ -265,12 +265,12 @@ NOT_JSON = {
 
 def _train(*arguments: str) -> tuple[str, tuple[str, ...]]:
     out = () if any(a.startswith("--out") for a in arguments) else ("--out={folder}/run",)
-    return "train", (*out, "--tune_runtime=off", *arguments)
+    return "train", last_of_each((*out, "--tune_runtime=off", *arguments))
 
 
 def _evaluate(*arguments: str) -> tuple[str, tuple[str, ...]]:
     run = () if any(a.startswith("--run") for a in arguments) else ("--run={source}",)
-    return "evaluate", (*run, "--games=1", "--tune_runtime=off", *arguments)
+    return "evaluate", last_of_each((*run, "--games=1", "--tune_runtime=off", *arguments))
 
 
 def _draw(*arguments: str) -> tuple[str, tuple[str, ...]]:
@@ -374,9 +374,9 @@ def _flags() -> Iterator[Case]:
         + (("seeds", "-1"), ("seconds", "nan"), ("seconds", "inf"), ("seconds", "-1"), ("seconds", "0")),
     }
     for program, values in benchmarks.items():
-        also = () if program == "bench" or values == "tpu" else ("--device=cpu",)
+        also = () if program == "bench" else ("--device=cpu",)
         for flag, text in values:
-            call = f"benchmarks.{program}", (*also, f"--{flag}={text}")
+            call = f"benchmarks.{program}", last_of_each((*also, f"--{flag}={text}"))
             yield Case(FLAGS, f"{program} --{flag}={text[:30]}", *call, flag)
 
 

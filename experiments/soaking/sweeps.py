@@ -15,6 +15,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from experiments.flags import last_of_each
 from experiments.soaking import Count, Say
 from experiments.sweeping import manifest, states
 from srl_jax import checkpoint
@@ -39,7 +40,7 @@ KILLS = 20
 
 def soak(short: bool, folder: Path, say: Say) -> list[Count]:
     """See the module."""
-    flags = (*FIGURES, "--seeds=1", "--steps=1600") if short else FIGURES
+    flags = last_of_each((*FIGURES, "--seeds=1", "--steps=1600")) if short else FIGURES
     alone, killed = folder / "alone", folder / "killed"
     seconds = left_alone(command("figures", alone, flags), say)
     line = command("figures", killed, flags)

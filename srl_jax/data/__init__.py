@@ -3,6 +3,7 @@
 import csv
 import functools
 import importlib.resources
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -71,6 +72,80 @@ class Published(NamedTuple):
         return "; ".join(part for part in parts if part)
 
 
+POLICIES = ("random", "no-op")
+"""Policies that learn nothing: uniformly random actions; always the action that does nothing."""
+
+
+class ReferencePolicy(NamedTuple):
+    """What a policy that learns nothing scores in whole games; None: not known here, or the game has none.
+
+    Attributes:
+        game: an Atari-57 game, Catch or CatchDistractor.
+        policy: one of `POLICIES`.
+        return_mean: raw score, the mean over games.
+        return_std: standard deviation over games (n - 1).
+        episodes: games that were played.
+        length_mean: of a game, env steps.
+        sticky_actions: probability.
+        noop_max: random no-ops at the start of a game are fewer than this.
+        eval_max_steps: env steps after which a game was cut.
+        source: the command that plays these games again, or where the number was published.
+    """
+
+    game: str
+    policy: str
+    return_mean: float
+    return_std: float | None
+    episodes: int | None
+    length_mean: float | None
+    sticky_actions: float | None
+    noop_max: int | None
+    eval_max_steps: int | None
+    source: str
+
+    def differs_from(self, config: Config) -> str:
+        """One line on what differs from a run's evaluations, to be shown beside both; "" if nothing does."""
+        if self.episodes is None:
+            return f"published, {self.source}; not known: sticky actions"
+        there = {name: getattr(self, name) for name in ("sticky_actions", "noop_max", "eval_max_steps")}
+        return ", ".join(
+            f"{name.replace('_', ' ')} {value:,} (here {getattr(config, name):,})"
+            for name, value in there.items()
+            if value not in (None, getattr(config, name))
+        )
+
+
+def reference_policies(game: str) -> dict[str, ReferencePolicy]:
+    """What policies that learn nothing score in a game, by the names in `POLICIES`.
+
+    Both for Catch, CatchDistractor and the thesis' seven games, which this project played; "random" alone, as
+    published, for the other Atari-57 games; {} for any other.
+    """
+    found = {row.policy: row for row in _reference_policies() if row.game == game}
+    if not found and game in (scores := _reference_scores()):
+        unknown = (None,) * 6
+        found["random"] = ReferencePolicy(game, "random", scores[game][0], *unknown, _DQN_ZOO)
+    return {name: found[name] for name in POLICIES if name in found}
+
+
+def policies_from(lines: Iterable[str]) -> list[ReferencePolicy]:
+    """The rows of a table that `experiments.reference_policies` wrote.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is none.
+    """
+    rows = csv.DictReader(lines)
+    if rows.fieldnames != list(ReferencePolicy._fields):
+        raise ValueError("its columns are others")
+    return [_record(ReferencePolicy, row) for row in rows]
+
+
+@functools.cache
+def _reference_policies() -> list[ReferencePolicy]:
+    source = importlib.resources.files(__package__) / "reference_policies.csv"
+    return policies_from(source.read_text(encoding="utf-8").splitlines())
+
+
 def thesis_curve(figure: str, game: str, arm: str) -> tuple[np.ndarray, np.ndarray]:
     """One learning curve of the thesis: a single run, evaluated after each epoch.
 
@@ -129,12 +204,12 @@ def published(game: str) -> list[Published]:
         for name in ("Random", "Human")
     ]
     rows += [row for row in _rows("published.csv") if row["game"] == game]
-    return [
-        Published(
-            *(_KINDS.get(name, str)(row[name]) if row.get(name) else None for name in Published._fields)
-        )
-        for row in rows
-    ]
+    return [_record(Published, row) for row in rows]
+
+
+def _record(kind: type, row: Mapping[str, str]):
+    """A row of a table as a named tuple; an empty field is None."""
+    return kind(*(_KINDS.get(name, str)(row[name]) if row.get(name) else None for name in kind._fields))
 
 
 _KINDS = {
@@ -144,6 +219,12 @@ _KINDS = {
     "seeds": int,
     "sticky_actions": float,
     "epsilon": float,
+    "return_mean": float,
+    "return_std": float,
+    "episodes": int,
+    "length_mean": float,
+    "noop_max": int,
+    "eval_max_steps": int,
 }
 _DQN_ZOO = "google-deepmind/dqn_zoo dqn_zoo/atari_data.py"
 _NO_OPS = "mean of at least 3 games of at most 108,000 frames, after up to 30 no-ops"
