@@ -1,9 +1,10 @@
 """Runs read from disk, grouped by game and arm, and what may be compared with what.
 
-The layout is ROOT/GAME/ARM/seedN/; a run directory that lies elsewhere is an arm of its own name. Imports no
-jax.
+The layout is ROOT/GAME/ARM/seedN/; a run directory that lies elsewhere is an arm of its own name. A link to a
+run has the link's name. Imports no jax.
 """
 
+import os
 import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from experiments.directories import natural, runs_below
 from experiments.draw import read_rows
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.errors import ConfigError
@@ -42,8 +44,9 @@ class RunData(NamedTuple):
 
 def arm_name(path: Path) -> str:
     """The arm of a run directory: its parent's name if it is called seedN, else its own without _seedN."""
+    path = Path(os.path.abspath(path))  # of ".", too
     if re.fullmatch(r"seed\d+", path.name):
-        return path.absolute().parent.name
+        return path.parent.name
     return re.sub(r"_seed\d+$", "", path.name)
 
 
@@ -59,25 +62,29 @@ def load_run(path: Path) -> RunData:
     return RunData(path, config.game, arm_name(path), config.seed, config, rows)
 
 
-def load_runs(root: str | Path) -> list[RunData]:
-    """All runs in or below a directory, by game, arm and seed. What was moved aside as broken does not count.
+def load_runs(*roots: str | Path) -> list[RunData]:
+    """All runs in or below directories, by game, arm and seed; links are followed, each run is read once.
+
+    What was moved aside as broken does not count.
 
     Raises:
-        ConfigError: there is none, one cannot be read, or two are of the same game, arm and seed.
+        ConfigError: in one there is none, one cannot be read, or two are of the same game, arm and seed.
     """
-    root = Path(root)
-    found = [path.parent for path in [root / "config.json", *sorted(root.rglob("config.json"))]]
-    inside = {path: path.relative_to(root).parts for path in found if path.joinpath("config.json").is_file()}
-    paths = [path for path, parts in inside.items() if not any(".broken-" in part for part in parts)]
-    if not paths:
-        raise ConfigError(f"{root}: no run directory there (none has a config.json)")
+    paths: dict[str, Path] = {}
+    for root in map(Path, roots):
+        below = runs_below(root)
+        kept = [path for path in below if not any(".broken-" in x for x in path.relative_to(root).parts)]
+        if not kept:
+            raise ConfigError(f"{root}: no run directory there (none has a config.json)")
+        for path in kept:
+            paths.setdefault(os.path.realpath(path), path)
     runs: dict[tuple, RunData] = {}
-    for path in paths:
+    for path in paths.values():
         run = load_run(path)
         other = runs.setdefault((run.game, run.arm, run.seed), run)
         if other is not run:
             raise ConfigError(f"{path}: the same game, arm and seed as {other.path}; move one of them away")
-    return [runs[key] for key in sorted(runs)]
+    return [runs[key] for key in sorted(runs, key=lambda key: (key[0], natural(key[1]), key[2]))]
 
 
 def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:

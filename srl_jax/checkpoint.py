@@ -136,7 +136,7 @@ def save(
         about["config"] = json.loads(config.to_json())
         sign(temporary, about)
         _put_in_place(temporary, final)
-        up_to_this = [p for p in _all(home) if p.name <= final.name]
+        up_to_this = [p for p in _all(home) if int(p.name) <= env_steps]
         for old in up_to_this[:-keep] if keep else ():
             aside = home / f".{old.name}.old.partial"
             os.replace(old, aside)  # so that nobody takes one that is half removed for a checkpoint
@@ -349,7 +349,7 @@ def newest_good(run: str | Path, say: Callable[[str], None], at_most: int | None
     """
     problem = None
     folders = _all(Path(run) / "checkpoints")
-    for path in reversed([f for f in folders if at_most is None or f.name <= f"{at_most:09d}"]):
+    for path in reversed([f for f in folders if at_most is None or int(f.name) <= at_most]):
         if problem:
             say(f"{problem}; going on from the one before, {path.name}")
         try:
@@ -589,7 +589,8 @@ def _same(flag: str, config: Config, found: Config, field: str, what: str) -> No
 
 def _all(folder: Path) -> list[Path]:
     """The checkpoints of a folder, oldest first; whether they are whole, their manifests tell."""
-    return sorted(p for p in folder.glob("[0-9]*") if p.is_dir())
+    found = [p for p in folder.glob("[0-9]*") if re.fullmatch("[0-9]+", p.name) and p.is_dir()]
+    return sorted(found, key=lambda p: int(p.name))  # names have 9 digits, but more from a billion steps on
 
 
 def _about(entry: Entry) -> dict[str, Any]:

@@ -32,6 +32,37 @@ def test_no_run_and_the_same_run_twice_are_refused(tmp_path):
         collect.load_runs(tmp_path)
 
 
+def test_linked_runs_have_the_name_of_the_link(tmp_path):
+    for seed in (0, 1, 10):
+        write_run(tmp_path / f"disk/joint_seed{seed}", seed=seed)
+    write_run(tmp_path / "cmp/arm10/seed0")
+    write_run(tmp_path / "cmp/arm9/seed0")
+    (tmp_path / "cmp/joint").mkdir()
+    (tmp_path / "cmp/joint/seed0").symlink_to(tmp_path / "disk/joint_seed0")
+    (tmp_path / "cmp/other_seed1").symlink_to(tmp_path / "disk/joint_seed1")
+    (tmp_path / "cmp/joint_seed10").symlink_to(tmp_path / "disk/joint_seed10")
+    found = [(run.arm, run.seed) for run in collect.load_runs(tmp_path / "cmp")]
+    assert found == [("arm9", 0), ("arm10", 0), ("joint", 0), ("joint", 10), ("other", 1)]
+
+
+def test_several_directories_are_read_as_one(tmp_path):
+    for name in ("x/a/seed0", "y/b_seed0", "z"):
+        write_run(tmp_path / name)
+    (tmp_path / "y/again_seed0").symlink_to(tmp_path / "x/a/seed0")
+    places = [tmp_path / "x", tmp_path / "y", tmp_path / "z", tmp_path / "x/a"]
+    assert [run.arm for run in collect.load_runs(*places)] == ["a", "b", "z"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="empty: no run directory"):
+        collect.load_runs(tmp_path / "x", tmp_path / "empty")
+
+
+def test_the_arm_of_the_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(write_run(tmp_path / "joint/seed0"))
+    assert [run.arm for run in collect.load_runs(".")] == ["joint"]
+    monkeypatch.chdir(write_run(tmp_path / "alone_seed3"))
+    assert [run.arm for run in collect.load_runs(".")] == ["alone"]
+
+
 def test_runs_of_an_arm_differ_in_their_seed_alone(tmp_path):
     write_run(tmp_path / "a/seed0", encoder_from="x/seed0")
     write_run(tmp_path / "a/seed1", encoder_from="x/seed1", seed=1)

@@ -411,3 +411,28 @@ def test_in_a_browser(runs, text, tmp_path):
     (found,) = browser.render(path, [390])
     lines = " ".join(browser.problems(found))
     assert "wide: <div" in lines and "asks for http://127" in lines and "x is not defined" in lines
+
+
+def test_an_encoder_is_from_an_arm_though_its_run_is_a_link(tmp_path):
+    from experiments.collect import load_runs
+    from experiments.reporting import numbers
+
+    write_run(tmp_path / "disk/Catch/source/seed0", mode="pretrain")
+    write_run(
+        tmp_path / "cmp/frozen_seed0", [0.0], mode="frozen", encoder_from="/gone/disk/Catch/source/seed0"
+    )
+    (tmp_path / "cmp/mine_seed0").symlink_to(tmp_path / "disk/Catch/source/seed0")
+    runs = load_runs(tmp_path / "cmp")
+    assert {cost.arm: cost.source for cost in numbers.costs(runs, ["frozen", "mine"], None)} == {
+        "frozen": "mine",
+        "mine": "",
+    }
+
+
+def test_arms_are_in_the_order_of_their_numbers(tmp_path):
+    from experiments.collect import load_runs
+    from experiments.reporting import numbers
+
+    for arm in ("weight10", "weight9", "weight100", "joint_50"):
+        write_run(tmp_path / arm / "seed0", [0.0])
+    assert numbers.arms_of(load_runs(tmp_path)) == ["joint_50", "weight9", "weight10", "weight100"]

@@ -9,6 +9,7 @@ import numpy as np
 
 from experiments import collect, diagnostic_plots
 from experiments.collect import RunData
+from experiments.directories import natural
 from experiments.reporting import diagnostics, numbers, pictures
 from experiments.reporting.contents import Content, Report, run_name
 from experiments.reporting.markup import Markup, breakable, details, figure, listed, plural, tag
@@ -28,7 +29,7 @@ OWN = ("learning_curve", "losses", "diagnostics", "drift")
 def figures(report: Report) -> Content:
     """What experiments.figures has drawn, with the title and the question beside it."""
     found = []
-    for path in sorted((report.root / "figures").glob("*.png")):
+    for path in sorted((report.root / "figures").glob("*.png"), key=lambda path: natural(path.name)):
         picture = pictures.taken(path, pictures.LARGEST)
         about = _beside(path.with_suffix(".json"))
         title, question = (str(about.get(key) or "") for key in ("title", "question"))
@@ -182,7 +183,7 @@ def _first_runs(report: Report, game: str) -> list[RunData]:
 
 
 def _panels(run: RunData) -> list[Path]:
-    found = sorted((run.path / "figures").glob("*.png"))
+    found = sorted((run.path / "figures").glob("*.png"), key=lambda path: natural(path.name))
     return [path for path in found if path.stem not in OWN]
 
 

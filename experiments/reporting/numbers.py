@@ -3,6 +3,7 @@
 Imports no jax.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,6 +12,7 @@ import numpy as np
 
 from experiments import collect
 from experiments.collect import RunData
+from experiments.directories import natural
 from experiments.presets import PRESETS
 from experiments.reporting import configs
 from srl_jax import statistics
@@ -85,7 +87,9 @@ def arms_of(runs: Sequence[RunData]) -> list[str]:
     """All arms: those of the presets in their order, then the others; those without a policy last."""
     known = {name.partition("/")[2] or name: i for i, name in reversed(list(enumerate(PRESETS)))}
     playing = {run.arm for run in runs if has_policy(run)}
-    return sorted({run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(PRESETS)), a))
+    return sorted(
+        {run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(PRESETS)), natural(a))
+    )
 
 
 def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None = None) -> str | None:
@@ -290,8 +294,9 @@ def _source(run: RunData, runs: Sequence[RunData]) -> str:
         return ""
     parts = Path(path).parts
     for other in runs:
-        tail = other.path.absolute().parts[-3:]
-        if any(parts[i : i + 3] == tail for i in range(len(parts))):
+        # As it is named here, and as it lies on disk: its directory may be a link.
+        tails = {p.parts[-3:] for p in (other.path.absolute(), Path(os.path.realpath(other.path)))}
+        if any(parts[i : i + 3] in tails for i in range(len(parts))):
             return other.arm
     return configs.source_name(path)
 
