@@ -63,7 +63,7 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
         panels: at least one, with at least one line.
         path: of the PNG file.
         title: of the figure.
-        note: below it.
+        note: below it; lines.
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
@@ -99,7 +99,7 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
 
         del handles[known]
         handles[known] = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
-    notes = [note] if note else []
+    notes = note.splitlines()
     for panel in panels:
         notes += [f"{panel.title}, {x.method}, {x.score:g}: {x.differs}" for x in panel.levels if x.differs]
     characters = int(17 * width * columns)

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from experiments import flags as config_flags
-from srl_jax import checkpoint, rundir
+from srl_jax import checkpoint, ending, rundir
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import PARTIAL, Config, difference, told_to_xla
 from srl_jax.errors import ConfigError, SaveError
@@ -216,6 +216,9 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
         return None
     if differing := difference(manifest.config, config):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
+    with contextlib.suppress(ConfigError):  # it informs and decides nothing
+        if (ended := ending.read(path)) is not None and ended.status == "diverged":
+            say(f"{path}: ended since {ended.reason}; the same code on the same machine gets there again")
     about = parse_json(read_bytes(path / "config.json", SETTINGS))
     then, now = about.get("environment"), told_to_xla()
     if then != now:

@@ -66,7 +66,8 @@ def evaluated(
 
     Args:
         figure: its first arm is the baseline.
-        runs: on disk; those of other arms and games are left out, and those that are not `comparable`.
+        runs: on disk; those of other arms and games are left out, and those that are not `comparable`, of
+            which it is said.
         games: in this order.
         methods: whose published scores are given, with what differs.
         force: compare runs of different protocols, and say what differs.
@@ -75,8 +76,8 @@ def evaluated(
         ConfigError: runs cannot be compared.
     """
     names = [arm.name for arm in figure.arms]
-    runs = [run for run in runs if run.arm in names and run.game in games and len(steps_and_returns(run)[0])]
-    collect.check_arms(runs)
+    runs = [run for run in runs if run.arm in names and run.game in games]
+    collect.check_arms([run for run in runs if len(steps_and_returns(run)[0])])
     forced = collect.check_protocols(runs, force=force)
     groups = collect.grouped(comparable(runs))
     result: dict[str, Any] = {
@@ -87,6 +88,10 @@ def evaluated(
         "arms": names,
         "level": 0.95,
         "forced": forced,
+        "left_out": [
+            {"game": run.game, "arm": run.arm, "seed": run.seed, "reason": why}
+            for run, why in collect.left_out(runs)
+        ],
         "games": {},
     }
     for game in games:
@@ -173,7 +178,20 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
     note = "bands: 95 % stratified bootstrap over seeds"
     if numbers["forced"]:
         note += "; PROTOCOLS DIFFER between runs"
+    note = "\n".join([note, *left_out_lines(numbers)])
     return curves.comparison(panels, path, f"{figure.name}  {figure.title}", note)
+
+
+def left_out_lines(numbers: Mapping[str, Any]) -> list[str]:
+    """A line for each arm on a game of which seeds are left out, from what `evaluated` gave."""
+    whys: dict[tuple[str, str], dict[int, str]] = {}
+    for run in numbers.get("left_out", ()):
+        whys.setdefault((run["game"], run["arm"]), {})[run["seed"]] = run["reason"]
+    lines = []
+    for (game, arm), seeds in whys.items():
+        there = numbers["games"].get(game, {"arms": {}})["arms"].get(arm, {"seeds": ()})
+        lines.append(f"{game}, {collect.left_out_text(arm, seeds, len(seeds) + len(there['seeds']))}")
+    return lines
 
 
 def _limits(interval: statistics.Interval) -> dict[str, Any]:
@@ -276,7 +294,8 @@ def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directo
     """
     numbers = evaluated(figure, runs, games, **how)
     if not numbers["games"]:
-        raise ConfigError(f"no evaluation of any arm of figure {figure.name} in {directory.parent}")
+        why = "".join(f"; {line}" for line in left_out_lines(numbers))
+        raise ConfigError(f"no evaluation of any arm of figure {figure.name} in {directory.parent}{why}")
     directory.mkdir(exist_ok=True)
     (directory / f"{figure.name}.json").write_text(json.dumps(numbers, indent=1) + "\n")
     return draw(figure, numbers, directory / f"{figure.name}.png")

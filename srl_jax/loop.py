@@ -6,6 +6,7 @@ Both work on the parameters and the replay of the step before, and meet before t
 has a thread, too, and is awaited before the next row is written. So no result depends on timing.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -15,12 +16,13 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax import checkpoint, envs, snapshot
+from srl_jax import checkpoint, ending, envs, snapshot
 from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for, yielding_thread
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics.measure import Diagnostics
-from srl_jax.errors import ConfigError, Diverged
+from srl_jax.ending import Ending
+from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.evaluator import Evaluator, Moment
 from srl_jax.replay import Replay
 from srl_jax.reporting import Report
@@ -56,8 +58,11 @@ def train(
     progress: bool = True,
     resume: checkpoint.Manifest | None = None,
     stop: Callable[[], bool] = lambda: False,
+    agent: Agent | None = None,
 ) -> Result:
     """Trains one agent, writing `metrics.jsonl` and `checkpoints/` into a run directory that exists.
+
+    How it ended goes to `ended.json`, see `srl_jax.ending`; a ConfigError changes nothing there.
 
     Args:
         config: of the run, resolved.
@@ -67,13 +72,25 @@ def train(
             `srl_jax.checkpoint.verify`; what follows is what would have followed had the run not ended there.
         stop: asked after each step; once it says so, a checkpoint is written and training ends. A
             KeyboardInterrupt instead, in the middle of a step, leaves the last checkpoint.
+        agent: of this configuration, where it is made already.
 
     Raises:
         ConfigError: a spec or a checkpoint to start from does not fit.
         Diverged: a loss is no longer finite; the last checkpoint is from before.
         SaveError: something could not be written; the last checkpoint is whole.
     """
-    return Run(config, Path(out), progress, resume=resume, stop=stop).train()
+    out, run = Path(out), None
+    try:
+        run = Run(config, out, progress, agent, resume=resume, stop=stop)
+        result = run.train()
+    except ConfigError:
+        raise
+    except BaseException as error:
+        with contextlib.suppress(SaveError):  # what ended the run is what is told
+            ending.write(out, ending.of(error, run.env_steps if run else 0))
+        raise
+    ending.write(out, Ending("stopped" if result.interrupted else "finished", result.env_steps))
+    return result
 
 
 def greedy_policy(agent: Agent, params: Any, key: jax.Array) -> Policy:
@@ -194,6 +211,7 @@ class Run:
         finished = False
         try:
             with self.report, self.env_thread, self.evaluator:
+                ending.clear(self.out)
                 try:
                     finished = self.run()
                 except (KeyboardInterrupt, BrokenBarrierError):  # the latter where another seed was the first

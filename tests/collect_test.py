@@ -4,8 +4,9 @@ import pytest
 
 from experiments import collect
 from srl_jax.config import Config
+from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
-from tests.helpers import write_run
+from tests.helpers import NOT_FINITE, write_run
 
 
 def test_runs_are_found_and_grouped(tmp_path):
@@ -61,6 +62,36 @@ def test_the_arm_of_the_working_directory(tmp_path, monkeypatch):
     assert [run.arm for run in collect.load_runs(".")] == ["joint"]
     monkeypatch.chdir(write_run(tmp_path / "alone_seed3"))
     assert [run.arm for run in collect.load_runs(".")] == ["alone"]
+
+
+def test_a_run_that_failed_is_neither_compared_nor_under_way(tmp_path):
+    write_run(tmp_path / "a/seed0", (0, 1, 2))
+    write_run(tmp_path / "a/seed1", (0,), seed=1, ended=NOT_FINITE)
+    write_run(tmp_path / "a/seed2", (0, 1), seed=2, ended=NOT_FINITE)
+    write_run(tmp_path / "b/seed0", (0, 1, 2), ended=Ending("finished", 200))
+    write_run(tmp_path / "b/seed1", (0, 1), seed=1, ended=Ending("stopped", 100))
+    write_run(tmp_path / "b/seed2", (0,), seed=2)
+    write_run(tmp_path / "b/seed3", (), seed=3)
+    write_run(tmp_path / "c/seed0", (), mode="pretrain")
+    runs = collect.load_runs(tmp_path)
+    assert [(run.arm, run.seed) for run in collect.comparable(runs)] == [("a", 0), ("b", 0), ("b", 1)]
+    left = {(run.arm, run.seed): why for run, why in collect.left_out(runs)}
+    assert left == {
+        ("a", 1): NOT_FINITE.reason,
+        ("a", 2): NOT_FINITE.reason,
+        ("b", 2): "has only begun",
+        ("b", 3): "not evaluated yet",
+    }
+    # One that failed says nothing of how far the others of its game are.
+    alone = [run for run in runs if run.seed == 2]
+    assert [(run.arm, run.seed) for run in collect.comparable(alone)] == [("b", 2)]
+
+
+def test_what_is_left_out_is_said_in_a_line():
+    assert collect.left_out_text("a", {2: "x"}, 3) == "a: 1 of 3 seeds left out: x (seed 2)"
+    assert collect.left_out_text("a", {0: "x"}, 1) == "a: 1 of 1 seed left out: x (seed 0)"
+    text = collect.left_out_text("a", {0: "x", 1: "y", 2: "x"}, 3)
+    assert text == "a: 3 of 3 seeds left out: x (seed 0, 2); y (seed 1)"
 
 
 def test_runs_of_an_arm_differ_in_their_seed_alone(tmp_path):

@@ -11,10 +11,10 @@ import pytest
 
 from experiments import directories
 from experiments.directories import all_to_resume, check_out, run_directory, to_resume
-from srl_jax import checkpoint, rundir
+from srl_jax import checkpoint, ending, rundir
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
-from tests.helpers import write_run
+from tests.helpers import NOT_FINITE, write_run
 from tests.rundir_test import contents
 
 CONFIG = Config(game="Catch", frame_size=42, steps=500, checkpoint_every=100, num_envs=4)
@@ -103,6 +103,16 @@ def test_xla_that_is_told_something_else_is_said(tmp_path, monkeypatch, capsys):
     assert to_resume(tmp_path / "run", CONFIG) == made[-1]
     line = capsys.readouterr().err
     assert "'XLA_FLAGS': '--a'" in line and "'XLA_FLAGS': '--b'" in line and "roundings differ" in line
+
+
+def test_a_run_that_diverged_goes_on_and_it_is_said(tmp_path, capsys):
+    (made,) = make(tmp_path / "run", checkpoints=(100,))
+    ending.write(tmp_path / "run", NOT_FINITE)
+    assert to_resume(tmp_path / "run", CONFIG) == made
+    assert "ended since loss/rl is not finite after 330 env steps" in capsys.readouterr().err
+    (tmp_path / "run/ended.json").write_text("{")  # nothing depends on it
+    assert to_resume(tmp_path / "run", CONFIG) == made
+    assert capsys.readouterr().err == ""
 
 
 def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(tmp_path):

@@ -13,8 +13,10 @@ from experiments import flags as config_flags
 from experiments import plots, report
 from experiments.collect import RunData
 from experiments.reporting import browser
+from srl_jax import ending
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from tests.helpers import NOT_FINITE
 
 pytestmark = pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
 
@@ -411,6 +413,34 @@ def test_in_a_browser(runs, text, tmp_path):
     (found,) = browser.render(path, [390])
     lines = " ".join(browser.problems(found))
     assert "wide: <div" in lines and "asks for http://127" in lines and "x is not defined" in lines
+
+
+def test_seeds_that_failed_are_named_and_cut_nothing(tmp_path):
+    diag = {"diag/effective_rank": [1.0, 2.0, 3.0]}
+    for seed in (0, 1):
+        write_run(tmp_path / f"rl/seed{seed}", [0.0, 1.0, 1.0], seed=seed, diag=diag)
+        # It would be the baseline, as its name sorts first.
+        ending.write(write_run(tmp_path / f"bad/seed{seed}", [0.0, 9.0], seed=seed), NOT_FINITE)
+    half = {"mode": "joint", "objectives": ("reconstruction",)}
+    write_run(tmp_path / "half/seed0", [0.0, 1.0, 2.0], diag=diag, **half)
+    ending.write(write_run(tmp_path / "half/seed1", [0.0, 1.0], diag=diag, seed=1, **half), NOT_FINITE)
+    page = Page(build(tmp_path, media=False))
+    assert list(page.table("Statistics of Catch")) == ["arm", "rl", "half"]
+    assert page.table("Statistics of Catch")["half"][1] == "2.00 (no interval)"
+    text = f"Failed, not compared:Catch / bad / seed 0: {NOT_FINITE.reason} Catch / bad / seed 1:"
+    assert text in page.text and "Not finished" not in page.text and "3 of 6 runs" in page.text
+    bad = f"bad: 2 of 2 seeds left out: {NOT_FINITE.reason} (seed 0, 1)"
+    half = f"half: 1 of 2 seeds left out: {NOT_FINITE.reason} (seed 1)"
+    assert f"Not compared:{bad} {half}" in page.text
+    assert f"Catch, {half}." in page.text and f"Catch, {bad}." in page.text  # beside the curves
+    assert page.table("Every run")["Catch / bad / seed 0"][1] == "failed"
+    assert "rl (2 seeds) half (1 seed)" in page.text
+
+
+def test_a_page_of_runs_that_all_failed(tmp_path):
+    ending.write(write_run(tmp_path / "a/seed0", [0.0]), NOT_FINITE)
+    page = Page(build(tmp_path, media=False))
+    assert f"Not compared:a: 1 of 1 seed left out: {NOT_FINITE.reason}" in page.text
 
 
 def test_an_encoder_is_from_an_arm_though_its_run_is_a_link(tmp_path):

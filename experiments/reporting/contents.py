@@ -53,6 +53,15 @@ class Report(NamedTuple):
         """The runs of a game, or of one arm on it."""
         return [run for run in self.runs if run.game == game and arm in (None, run.arm)]
 
+    def left_out(self, game: str) -> list[str]:
+        """A line for each arm of a game of which seeds cannot be compared."""
+        whys: dict[str, dict[int, str]] = {arm: {} for arm in self.arms}
+        for run, why in collect.left_out(self.of(game)):
+            whys[run.arm][run.seed] = why
+        return [
+            collect.left_out_text(arm, seeds, len(self.of(game, arm))) for arm, seeds in whys.items() if seeds
+        ]
+
     def seeds_behind(self, arm: str, game: str | None = None) -> int:
         """Of a difference from the baseline: the fewest that it or the arm has, on the game or on any."""
         games = [game] if game is not None else self.comparisons

@@ -75,10 +75,9 @@ def learning_curves(report: Report) -> Content:
             drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))
     if not drawn:
         return None
-    note = (
-        "Mean evaluation return, and its 95 % interval over seeds, at env steps that all runs of a game have."
-    )
-    return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
+    left_out = [f"{game}, {line}. " for game in report.games for line in report.left_out(game)]
+    note = "Mean evaluation return, and its 95 % interval over seeds, at env steps that all of a game have. "
+    return [tag("p", note, *left_out, class_="note"), tag("div", drawn, class_="grid wide")]
 
 
 def profiles(report: Report) -> Content:
@@ -178,8 +177,13 @@ def _by_game(report: Report, cells: Callable[[RunData], list[Markup]], kind: str
 
 
 def _first_runs(report: Report, game: str) -> list[RunData]:
-    """The first seed of each arm."""
-    return [runs[0] for arm in report.arms if (runs := report.of(game, arm))]
+    """The first seed of each arm that has not failed."""
+    return [runs[0] for arm in report.arms if (runs := _sound(report, game, arm))]
+
+
+def _sound(report: Report, game: str, arm: str | None = None) -> list[RunData]:
+    """The runs of a game, or of one arm on it, that have not failed: others would cut all curves."""
+    return [run for run in report.of(game, arm) if not run.failed]
 
 
 def _panels(run: RunData) -> list[Path]:
@@ -206,14 +210,14 @@ def diagnostic_pictures(report: Report) -> Content:
         )
     parts: list = []
     for game in report.games:
-        found = diagnostics.panels(report.of(game), report.arms)
+        found = diagnostics.panels(_sound(report, game), report.arms)
         if not found:
             continue
         first, others = (
             [_panel(game, panel) for panel in found if panel.first == at_once] for at_once in (True, False)
         )
-        having = {run.arm for run in report.of(game) if diagnostics.keys_of([run])}
-        seeds = {arm: len(report.of(game, arm)) for arm in report.arms if arm in having}
+        having = {run.arm for run in _sound(report, game) if diagnostics.keys_of([run])}
+        seeds = {arm: len(_sound(report, game, arm)) for arm in report.arms if arm in having}
         parts += [tag("h3", game), _legend(report, seeds), tag("div", first, class_="grid small")]
         if others:
             more = f"{plural(len(others), 'more picture')} of {game}"
@@ -221,7 +225,7 @@ def diagnostic_pictures(report: Report) -> Content:
         parts.append(_drift(report, game))
     if without:
         parts.append(tag("p", f"Without diagnostics: {listed(map(run_name, without))}.", class_="note"))
-    note = "Measured at every evaluation; means and 95 % intervals over seeds."
+    note = "Measured at every evaluation; means and 95 % intervals over seeds that have not failed."
     return [tag("p", note, class_="note"), *parts]
 
 

@@ -11,13 +11,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import collect
-from experiments.collect import RunData
+from experiments.collect import RunData, has_policy
 from experiments.directories import natural
 from experiments.presets import PRESETS
 from experiments.reporting import configs
 from srl_jax import statistics
 from srl_jax.errors import ConfigError
-from srl_jax.modes import MODES
 from srl_jax.specs import LIMITS
 
 NEVER = 1e18
@@ -95,7 +94,8 @@ def arms_of(runs: Sequence[RunData]) -> list[str]:
 def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None = None) -> str | None:
     """The arm that others are compared with, or None where no arm has a policy.
 
-    The one that was asked for, else the first that is RL alone, else the first with a policy.
+    The one that was asked for, else the first that is RL alone, else the first with a policy: of those that
+    can be compared, as long as there are some.
 
     Raises:
         ConfigError: the one that was asked for is not there.
@@ -107,13 +107,9 @@ def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None 
                 f"--baseline={given}: not an arm with a policy; valid: {', '.join(sorted(playing))}"
             )
         return given
-    plain = {run.arm for run in runs if run.config.mode == "rl_only"}
-    return next((arm for arm in arms if arm in plain), next((arm for arm in arms if arm in playing), None))
-
-
-def has_policy(run: RunData) -> bool:
-    """Whether its mode trains a policy, which is then evaluated."""
-    return MODES[run.config.mode].rl
+    playing = {run.arm for run in collect.comparable(runs)} or playing
+    plain = {run.arm for run in runs if run.config.mode == "rl_only"} & playing
+    return next((arm for arm in arms if arm in (plain or playing)), None)
 
 
 def reached_step(run: RunData) -> int:
@@ -122,8 +118,13 @@ def reached_step(run: RunData) -> int:
 
 
 def finished(run: RunData) -> bool:
-    """Whether its last rows are there: those of its last env steps, or of the return that ends a run."""
+    """Whether its last rows are there: those of its last env steps, or of the return that ends a run.
+
+    Not where it ended with an error all the same.
+    """
     config = run.config
+    if run.failed:
+        return False
     steps, returns = collect.steps_and_returns(run)
     if config.stop_at_return is not None and (returns >= config.stop_at_return).any():
         return True

@@ -41,7 +41,10 @@ def what_was_run(report: Report) -> Content:
         ("Directory", tag("code", report.root.absolute().name)),
     ]
     parts: list = [tag("dl", [[tag("dt", name), tag("dd", value)] for name, value in facts])]
-    if left := [run for run, done in zip(report.runs, ended, strict=True) if not done]:
+    if failed := [run for run in report.runs if run.failed]:
+        items = [tag("li", f"{run_name(run)}: {run.ended.reason}") for run in failed]
+        parts.append(tag("div", tag("strong", "Failed, not compared:"), tag("ul", items), class_="warn"))
+    if left := [r for r, done in zip(report.runs, ended, strict=True) if not (done or r.failed)]:
         items = [
             tag("li", f"{run_name(run)}: {numbers.reached_step(run):,} of {run.config.steps:,} env steps")
             for run in left
@@ -85,7 +88,8 @@ def _all_runs(report: Report, abouts: Sequence[About]) -> Markup:
         steps, returns = collect.steps_and_returns(run)
         last = f"{number(float(returns[-1]))} at {steps[-1]:,}" if len(steps) else "–"
         cells = [run_name(run), f"{numbers.reached_step(run):,} of {run.config.steps:,}"]
-        cells += ["yes" if numbers.finished(run) else "no", len(steps), last, _short(about)]
+        how = "failed" if run.failed else "yes" if numbers.finished(run) else "no"
+        cells += [how, len(steps), last, _short(about)]
         cells += [about.started or "–", tag("code", run.path.relative_to(report.root))]
         rows.append(cells)
     head = ("run", "env steps", "finished", "evaluations", "last return", "revision", "begun", "directory")
