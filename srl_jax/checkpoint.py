@@ -534,6 +534,17 @@ def load_into(template: Any, tree: Any, what: str) -> Any:
     return jax.tree.unflatten(jax.tree.structure(template), jax.tree.leaves(restored))
 
 
+def is_part(template: Any, tree: Any) -> bool:
+    """Whether a tree from `load` holds a part of a template's parameters, and nothing else."""
+    from flax import serialization
+
+    whole, found = (
+        {name for name, x in _flat(branch).items() if not isinstance(x, dict)}
+        for branch in (serialization.to_state_dict(template), tree)
+    )
+    return found < whole
+
+
 def _flat(tree: Any, path: str = "") -> dict[str, Any]:
     """{path: leaf} of nested dicts, as ['encoder']['kernel']; an empty dict is a leaf."""
     if not isinstance(tree, dict) or not tree:

@@ -26,7 +26,7 @@ from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.evaluator import Evaluator, Moment
 from srl_jax.replay import Replay
 from srl_jax.reporting import Report
-from srl_jax.types import Params, Window
+from srl_jax.types import Encoder, Params, Window
 from srl_jax.update import Hyper, make_latents, named_key
 
 PICTURES = 6
@@ -127,16 +127,47 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
     """An agent, its parameters and the manifest of a checkpoint or of a run's newest one.
 
     Raises:
+        srl_jax.errors.ConfigError: there is none, it is damaged, does not fit this code, or it is an encoder
+            that was kept alone, see `load_encoder`.
+    """
+    manifest = checkpoint.read_manifest(path)
+    agent, template = _agent_of(manifest)
+    tree = checkpoint.load(manifest)
+    if checkpoint.is_part(template, tree):
+        raise ConfigError(
+            f"{manifest.path}: a kept encoder, without a policy; name the run or one of its checkpoints "
+            "(srl_jax.loop.load_encoder and --encoder_from take kept encoders)"
+        )
+    return agent, checkpoint.load_into(template, tree, str(manifest.path)), manifest
+
+
+def load_encoder(path: str | Path) -> tuple[Encoder, Params, checkpoint.Manifest]:
+    """The encoder of a run, of one of its checkpoints, or one that was kept, `RUN/encoders/ENV_STEPS`.
+
+        encoder, params, manifest = load_encoder("runs/pong/encoders/000002000")
+        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S] -> float32 [B, encoder.features]
+
+    Raises:
         srl_jax.errors.ConfigError: there is none, it is damaged, or does not fit this code.
     """
     manifest = checkpoint.read_manifest(path)
+    encoder = _agent_of(manifest)[0].encoder
+    return encoder, _encoder_params(encoder, manifest, str(manifest.path)), manifest
+
+
+def _agent_of(manifest: checkpoint.Manifest) -> tuple[Agent, Any]:
+    """The agent of a checkpoint's configuration, and the shapes of its parameters."""
     try:
         agent = make_agent(manifest.config, manifest.num_actions)
-        template = agent.shapes().params
+        return agent, agent.shapes().params
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{manifest.path}: {error}") from None
-    params = checkpoint.load_into(template, checkpoint.load(manifest), str(manifest.path))
-    return agent, params, manifest
+
+
+def _encoder_params(encoder: Encoder, manifest: checkpoint.Manifest, what: str) -> Params:
+    """A checkpoint's encoder in the form of this one; `what` names it in errors."""
+    template = jax.eval_shape(encoder.init, jax.random.key(0))
+    return checkpoint.load_into(template, checkpoint.load(manifest)["encoder"], what)
 
 
 class Run:
@@ -518,9 +549,7 @@ class Run:
         if not self.config.encoder_from:
             return None
         manifest = checkpoint.read_manifest(self.config.encoder_from)
-        template = jax.eval_shape(self.agent.encoder.init, self.key)
-        tree = checkpoint.load(manifest)["encoder"]
-        return checkpoint.load_into(template, tree, f"--encoder_from={self.config.encoder_from}")
+        return _encoder_params(self.agent.encoder, manifest, f"--encoder_from={self.config.encoder_from}")
 
     def given_policy(self) -> Policy:
         """The policy of `policy_from`, without noise."""

@@ -18,7 +18,7 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.update import Hyper
-from tests.helpers import JOINT, SMALL
+from tests.helpers import JOINT, SMALL, identical
 
 
 def train(path, progress=False, stop=None, **values):
@@ -381,6 +381,29 @@ def test_early_stop(tmp_path):
     assert result.env_steps == 40 and ending.read(tmp_path / "run") == ("finished", 40, "")
     assert checkpoint.read_manifest(tmp_path / "run").env_steps == 40
     assert [row["kind"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl")] == ["eval"]
+
+
+def test_the_encoder_of_a_run_of_a_checkpoint_and_one_that_was_kept(joint):
+    path, _ = joint
+    agent, params, _ = loop.load_agent(path)
+    observations = np.random.default_rng(0).integers(0, 256, (2, 42, 42, 4), dtype=np.uint8)
+    newest = whole(path).path
+    for place in (path, path / "checkpoints", newest):
+        encoder, mine, manifest = loop.load_encoder(place)
+        assert manifest.path == newest and identical(mine, params["encoder"])
+    latents = encoder.apply(mine, observations)
+    assert latents.shape == (2, 8) and identical(
+        latents, agent.encoder.apply(params["encoder"], observations)
+    )
+    kept = path / "encoders" / "000000000"
+    encoder, first, manifest = loop.load_encoder(kept)
+    assert manifest.env_steps == 0 and not identical(encoder.apply(first, observations), latents)
+    # There is no policy to play with in it, wherever it lies.
+    for place in (kept, shutil.copytree(kept, path.parent / "elsewhere")):
+        with pytest.raises(ConfigError, match=f"^{place}: a kept encoder, without a policy; name the run or"):
+            loop.load_agent(place)
+    with pytest.raises(ConfigError, match="no checkpoint there"):
+        loop.load_encoder(path / "figures")
 
 
 def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
