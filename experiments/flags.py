@@ -3,7 +3,6 @@
 Flags are defined here, for the entry points, and nowhere else in the library. Imports no jax.
 """
 
-import difflib
 import functools
 import logging
 import os
@@ -254,8 +253,8 @@ def parse(
             values[positional].parse(rest.pop(1))
             values[positional].present += 1
     except flags.UnrecognizedFlagError as error:
-        near = difflib.get_close_matches(error.flagname, list(values), n=1, cutoff=0.6)
-        suggestion = f"did you mean --{near[0]}? " if near else ""
+        near = specs.near(error.flagname, values)
+        suggestion = f"did you mean {' or '.join(f'--{name}' for name in near)}? " if near else ""
         fail(f"--{error.flagname}: no such flag; {suggestion}--helpfull lists them all")
     except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
         fail(str(error).removeprefix("flag "))
