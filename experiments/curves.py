@@ -73,7 +73,9 @@ def comparison(panels: Sequence[Panel], path: str | os.PathLike, title: str, not
     figure = plots.new_figure(width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)
     handles: dict[str, object] = {}
     for i, panel in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, i + 1, xlabel=plots.STEPS_LABEL, ylabel="mean return")
+        axes = figure.add_subplot(
+            rows, columns, i + 1, xlabel=plots.steps_label(panel.title), ylabel="mean return"
+        )
         axes.set_title(panel.title, fontsize=10, parse_math=False)
         end = max((max(line.steps) for line in panel.lines if len(line.steps)), default=1)
         for line in panel.lines:

@@ -55,11 +55,12 @@ def draw_run(
     rows = read_rows(run / "metrics.jsonl")
     figures = run / "figures"
     title = f"{config.game}, {config.mode}, {config.encoder.partition(':')[0]}, seed {config.seed}"
-    curve = plots.learning_curve(
-        rows, figures / "learning_curve.png", title, _reference(config, thesis) if thesis else None
-    )
-    written = [curve, plots.losses(rows, figures / "losses.png")]
-    written.append(diagnostic_plots.diagnostics(rows, figures / "diagnostics.png", title))
+    reference, game = _reference(config, thesis) if thesis else None, config.game
+    written = [
+        plots.learning_curve(rows, figures / "learning_curve.png", title, reference, game),
+        plots.losses(rows, figures / "losses.png", game),
+        diagnostic_plots.diagnostics(rows, figures / "diagnostics.png", title, game),
+    ]
     written.append(diagnostic_plots.drift_matrix(rows, figures / "drift.png", title))
     for name, (inputs, targets, outputs) in (pictures or {}).items():
         path = figures / f"{name}.png"

@@ -261,6 +261,20 @@ def test_a_page_of_runs_of_before(tmp_path):
     assert "pretrain" in page.table("Settings on Catch")["field"]
 
 
+def test_what_only_atari_has_is_said_of_atari_alone(tmp_path):
+    from experiments.reporting.configs import protocol_text
+
+    catch, pong = (protocol_text(Config(game=game, frame_size=84)) for game in ("Catch", "Pong"))
+    assert catch == (
+        "10 full games an evaluation, every 100,000 env steps; epsilon 0.005; at most 27,000 env steps a game"
+    )
+    assert pong == catch.replace(
+        "; at most", "; no sticky actions; fewer than 30 no-ops at the start; at most"
+    ) + (", of 4 frames each; in training, a lost life ends the return")
+    labels = [plots.steps_label(game) for game in ("Pong", "CatchDistractor", "")]
+    assert labels == ["env steps (4 frames each)", "env steps", "env steps"]
+
+
 def test_other_protocols_are_refused_or_said(tmp_path):
     write_run(tmp_path / "a/seed0", [0.0, 1.0])
     write_run(tmp_path / "a/seed1", [0.0, 1.0], gamma=0.5, seed=1)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments import collect, diagnostic_plots
+from experiments import collect, diagnostic_plots, plots
 from experiments.collect import RunData
 from experiments.directories import natural
 from experiments.reporting import diagnostics, numbers, pictures
@@ -68,8 +68,9 @@ def learning_curves(report: Report) -> Content:
         limits = _limits_of(curves.values(), levels)
         for group in groups(arms, report.baseline):
             lines = {report.arms.index(arm): curves[report.arms.index(arm)] for arm in group}
+            across = plots.steps_label(game)
             picture = pictures.curves(
-                game, lines, size=(5.4, 3.5), label="mean return", levels=levels, limits=limits
+                game, lines, size=(5.4, 3.5), label="mean return", across=across, levels=levels, limits=limits
             )
             caption = _legend(report, {arm: len(comparison.returns[arm]) for arm in group})
             drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))

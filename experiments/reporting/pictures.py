@@ -209,7 +209,7 @@ def curves(
                 textcoords="offset points", fontsize=7, color="#555555", parse_math=False,
             )  # fmt: skip
         axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
-        (plots.count_axis if across == plots.STEPS_LABEL else plots.plain)(axes)
+        (plots.count_axis if across.startswith(plots.STEPS_LABEL) else plots.plain)(axes)
         axes.tick_params(labelsize=7 if small else 9)
         axes.set_xlabel(across, fontsize=7.5 if small else 9)
         axes.set_ylabel(label, fontsize=9)
