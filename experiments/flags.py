@@ -237,7 +237,7 @@ def parse(
     Args:
         argv: the program's name and its arguments.
         values: where the flags are defined.
-        positional: a flag whose value may be given without its name; None for none.
+        positional: a flag whose value, or values, may be given without its name; None for none.
 
     Returns:
         [the program's name].
@@ -250,8 +250,10 @@ def parse(
     try:
         rest = values(argv)
         if positional and len(rest) > 1 and not values[positional].present:
-            values[positional].parse(rest.pop(1))
+            several = isinstance(values[positional], flags.MultiFlag)
+            values[positional].parse(rest[1:] if several else rest[1])
             values[positional].present += 1
+            del rest[1 : None if several else 2]
     except flags.UnrecognizedFlagError as error:
         near = specs.near(error.flagname, values)
         suggestion = f"did you mean {' or '.join(f'--{name}' for name in near)}? " if near else ""

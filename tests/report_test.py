@@ -94,10 +94,10 @@ class Page(HTMLParser):
         return {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows}
 
 
-def build(runs, **options):
+def build(*runs, **options):
     from experiments.reporting import page
 
-    return page.build(runs, **options)
+    return page.build(*runs, **options)
 
 
 @pytest.fixture(scope="module")
@@ -381,9 +381,10 @@ def test_the_command_line(runs, tmp_path, capsys):
     assert written.startswith("<!doctype html>") and [p.name for p in out.parent.iterdir()] == ["report.html"]
     with pytest.raises(ConfigError, match="exists; .*--overwrite"):
         report.report(parsed(f"--out={out}", f"--runs={runs}"))
-    assert parsed(f"--out={out}", runs)["runs"].value == str(runs)
+    assert parsed(f"--out={out}", runs)["runs"].value == [str(runs)]
+    assert parsed("a", f"--out={out}", "b")["runs"].value == ["a", "b"]
+    assert parsed("--runs=a", "--runs=b")["runs"].value == ["a", "b"]
     for wrong, message in (
-        ([runs, runs], "unexpected argument"),
         ([f"--runs={runs}", runs], "unexpected argument"),
         ([runs, "--ovewrite"], "did you mean --overwrite"),
     ):
@@ -401,6 +402,7 @@ def test_the_command_line(runs, tmp_path, capsys):
         ([".", "--out=a/b\n.html"], "has the character"),
         ([".", "--out=file/a.html"], "not a directory"),
         (["none", "--out=a.html"], "--runs=none: no such directory"),
+        ([".", "none", "--out=a.html"], "--runs=none: no such directory"),
         ([".", "--out=a.html"], "no run directory"),
         ([".", "--out=a.html", "--reach=Pong"], "must be GAME=SCORE"),
         ([".", "--out=a.html", "--reach=Pong=nan"], "must be GAME=SCORE"),
@@ -471,6 +473,20 @@ def test_an_encoder_is_from_an_arm_though_its_run_is_a_link(tmp_path):
         "frozen": "mine",
         "mine": "",
     }
+
+
+def test_runs_of_several_directories_are_on_one_page(tmp_path, monkeypatch):
+    write_run(tmp_path / "one/fast_seed0", [0.0, 1.0])
+    write_run(tmp_path / "two/runs/slow", [0.0, 0.5], mode="joint", objectives=("reconstruction",))
+    page = Page(build(tmp_path / "one", tmp_path / "two/runs/slow", media=False))
+    assert list(page.table("Statistics of Catch")) == ["arm", "fast", "slow"]
+    places = {name: row[-1] for name, row in page.table("Every run").items()}
+    assert places["Catch / fast / seed 0"] == "one/fast_seed0" and places["Catch / slow / seed 0"] == "slow"
+    assert "one, slow" in page.text and str(tmp_path) not in page.text
+    monkeypatch.chdir(tmp_path / "two/runs/slow")
+    page = Page(build("..", media=False))
+    assert page.table("Every run")["Catch / slow / seed 0"][-1] == "slow"
+    assert "Directory runs" in page.text
 
 
 def test_arms_are_in_the_order_of_their_numbers(tmp_path):

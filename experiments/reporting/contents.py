@@ -1,5 +1,6 @@
 """What all sections of a report start from, and how they show intervals."""
 
+import os
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +22,7 @@ class Report(NamedTuple):
     """What all sections start from.
 
     Attributes:
-        root: where the runs are.
+        roots: where the runs are.
         runs: all of them.
         arms: in their order.
         baseline: what others are compared with, or None.
@@ -33,7 +34,7 @@ class Report(NamedTuple):
         media: whether pictures of the runs are shown.
     """
 
-    root: Path
+    roots: list[Path]
     runs: list[RunData]
     arms: list[str]
     baseline: str | None
@@ -52,6 +53,12 @@ class Report(NamedTuple):
     def of(self, game: str, arm: str | None = None) -> list[RunData]:
         """The runs of a game, or of one arm on it."""
         return [run for run in self.runs if run.game == game and arm in (None, run.arm)]
+
+    def place(self, run: RunData) -> Path:
+        """Where a run lies, below the directory that was named; with its name where there are several."""
+        root = next(root for root in self.roots if run.path.is_relative_to(root))
+        below = run.path.relative_to(root)
+        return below if len(self.roots) == 1 else name_of(root) / below
 
     def left_out(self, game: str) -> list[str]:
         """A line for each arm of a game of which seeds cannot be compared."""
@@ -72,6 +79,11 @@ class Report(NamedTuple):
             if comparison is not None
         ]
         return min(counts, default=0)
+
+
+def name_of(root: Path) -> Path:
+    """The name of a directory, also of "." and "..": what lies above is nobody's business."""
+    return Path(os.path.basename(os.path.abspath(root)))
 
 
 def run_name(run: RunData) -> str:

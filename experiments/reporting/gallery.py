@@ -1,6 +1,7 @@
 """The pictures of a report, in their sections."""
 
 import functools
+import itertools
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -29,7 +30,8 @@ OWN = ("learning_curve", "losses", "diagnostics", "drift")
 def figures(report: Report) -> Content:
     """What experiments.figures has drawn, with the title and the question beside it."""
     found = []
-    for path in sorted((report.root / "figures").glob("*.png"), key=lambda path: natural(path.name)):
+    paths = [sorted((x / "figures").glob("*.png"), key=lambda p: natural(p.name)) for x in report.roots]
+    for path in itertools.chain(*paths):
         picture = pictures.taken(path, pictures.LARGEST)
         about = _beside(path.with_suffix(".json"))
         title, question = (str(about.get(key) or "") for key in ("title", "question"))
