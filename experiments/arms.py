@@ -14,13 +14,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from experiments.flags import RL_OPTIONS
 from experiments.presets import PRESETS
 from srl_jax.config import INFOS
 from srl_jax.data import thesis_curve
 from srl_jax.envs import CATCH
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
-from srl_jax.specs import choices_text
+from srl_jax.specs import choices_text, near
 
 
 class FigureArm(NamedTuple):
@@ -158,7 +159,7 @@ def read_figure(path: Path) -> Figure:
             raise refuse(f"{what} is not a JSON object")
         for key, value in values.items():
             if key not in kinds:
-                raise refuse(f"{what} has no {choices_text(key, kinds)}")
+                raise refuse(f"{what} has no {key!r}; {choices_text(key, kinds)}")
             if not isinstance(value, kinds[key]):
                 raise refuse(f"{key} of {what} is not of type {kinds[key].__name__}")
         for key in needed:
@@ -179,7 +180,7 @@ def read_figure(path: Path) -> Figure:
     for number, arm in enumerate(values["arms"], 1):
         arm = check(arm, kinds, ("name", "preset"), f"arm {number}")
         if arm["preset"] not in PRESETS:
-            raise refuse(f"preset of arm {number}: {choices_text(arm['preset'], PRESETS)}")
+            raise refuse(f"arm {number}: no preset {arm['preset']!r}; {choices_text(arm['preset'], PRESETS)}")
         flags = {
             flag: _flag_text(refuse, number, flag, value) for flag, value in arm.get("flags", {}).items()
         }
@@ -196,9 +197,11 @@ def read_figure(path: Path) -> Figure:
 
 
 def _flag_text(refuse: Any, number: int, flag: str, value: Any) -> str | tuple[str, ...]:
-    known = {info.flag or name for name, info in INFOS.items()}
+    known = {info.flag or name for name, info in INFOS.items()} | RL_OPTIONS.keys()
     if flag not in known:
-        raise refuse(f"flag of arm {number}: {choices_text(flag, known)}")
+        close = near(flag, known)
+        meant = f"did you mean {' or '.join(close)}? " if close else ""
+        raise refuse(f"arm {number}: no flag {flag!r}; {meant}python -m experiments.train --help lists them")
     if isinstance(value, list) and all(isinstance(element, str) for element in value):
         return tuple(value)
     if isinstance(value, bool):

@@ -1,19 +1,24 @@
 """Runs read from disk, grouped by game and arm, and what may be compared with what.
 
-The layout is ROOT/GAME/ARM/seedN/; a run directory that lies elsewhere is an arm of its own name. Imports no
-jax.
+The layout is ROOT/GAME/ARM/seedN/; a run directory that lies elsewhere is an arm of its own name. A link to a
+run has the link's name. Imports no jax.
 """
 
+import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from experiments.directories import natural, runs_below
 from experiments.draw import read_rows
+from srl_jax import ending
 from srl_jax.config import INFOS, Config, difference
+from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
+from srl_jax.modes import MODES
 
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
@@ -30,6 +35,7 @@ class RunData(NamedTuple):
         game, arm, seed: what it is a run of.
         config: its config.json.
         rows: of its metrics.jsonl; none if it has not begun.
+        ended: how, or None: it is under way, or was killed, or is of before that was written.
     """
 
     path: Path
@@ -38,12 +44,19 @@ class RunData(NamedTuple):
     seed: int
     config: Config
     rows: list[dict]
+    ended: Ending | None = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether it ended with an error, and is not under way."""
+        return self.ended is not None and self.ended.failed
 
 
 def arm_name(path: Path) -> str:
     """The arm of a run directory: its parent's name if it is called seedN, else its own without _seedN."""
+    path = Path(os.path.abspath(path))  # of ".", too
     if re.fullmatch(r"seed\d+", path.name):
-        return path.absolute().parent.name
+        return path.parent.name
     return re.sub(r"_seed\d+$", "", path.name)
 
 
@@ -56,26 +69,31 @@ def load_run(path: Path) -> RunData:
     config = Config.load(path)
     metrics = path / "metrics.jsonl"
     rows = read_rows(metrics) if metrics.exists() else []
-    return RunData(path, config.game, arm_name(path), config.seed, config, rows)
+    return RunData(path, config.game, arm_name(path), config.seed, config, rows, ending.read(path))
 
 
-def load_runs(root: str | Path) -> list[RunData]:
-    """All runs in or below a directory, by game, arm and seed. What was moved aside as broken does not count.
+def load_runs(*roots: str | Path) -> list[RunData]:
+    """All runs in or below directories, by game, arm and seed; links are followed, each run is read once.
+
+    What was moved aside as broken does not count.
 
     Raises:
-        ConfigError: there is none, one cannot be read, or two are of the same game, arm and seed.
+        ConfigError: in one there is none, one cannot be read, or two are of the same game, arm and seed.
     """
-    root = Path(root)
-    paths = _directories(root)
-    if not paths:
-        raise ConfigError(f"{root}: no run directory there (none has a config.json)")
+    paths: dict[str, Path] = {}
+    for root in map(Path, roots):
+        kept = _directories(root)
+        if not kept:
+            raise ConfigError(f"{root}: no run directory there (none has a config.json)")
+        for path in kept:
+            paths.setdefault(os.path.realpath(path), path)
     runs: dict[tuple, RunData] = {}
-    for path in paths:
+    for path in paths.values():
         run = load_run(path)
         other = runs.setdefault((run.game, run.arm, run.seed), run)
         if other is not run:
             raise ConfigError(f"{path}: the same game, arm and seed as {other.path}; move one of them away")
-    return [runs[key] for key in sorted(runs)]
+    return [runs[key] for key in sorted(runs, key=lambda key: (key[0], natural(key[1]), key[2]))]
 
 
 def arm_names(root: Path) -> list[str]:
@@ -84,9 +102,8 @@ def arm_names(root: Path) -> list[str]:
 
 
 def _directories(root: Path) -> list[Path]:
-    found = [path.parent for path in [root / "config.json", *sorted(root.rglob("config.json"))]]
-    inside = {path: path.relative_to(root).parts for path in found if path.joinpath("config.json").is_file()}
-    return [path for path, parts in inside.items() if not any(".broken-" in part for part in parts)]
+    below = runs_below(root)
+    return [path for path in below if not any(".broken-" in part for part in path.relative_to(root).parts)]
 
 
 def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:
@@ -104,16 +121,55 @@ def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
     return steps, np.array([row["eval/return_mean"] for row in rows], np.float64)
 
 
-def comparable(runs: Sequence[RunData]) -> list[RunData]:
-    """Runs whose learning curves can be laid beside each other, in their order.
+def has_policy(run: RunData) -> bool:
+    """Whether its mode trains a policy, which is then evaluated."""
+    return MODES[run.config.mode].rl
 
-    One without evaluations is left out, and one with a single evaluation where others of its game have more:
-    it has only just begun, and would cut the curves of all others down to that env step.
+
+def comparable(runs: Sequence[RunData]) -> list[RunData]:
+    """Runs whose learning curves can be laid beside each other, in their order; the others, `left_out` has.
+
+    One that ended with an error is left out however far it got, one without evaluations, and one with a
+    single evaluation where others of its game have more: it has only just begun. Each would cut the curves of
+    all others down to where it is.
     """
-    points = [len(steps_and_returns(run)[0]) for run in runs]
+    return [run for run, why in zip(runs, _why_not(runs), strict=True) if not why]
+
+
+def left_out(runs: Sequence[RunData]) -> list[tuple[RunData, str]]:
+    """The runs with a policy that are not `comparable`, and why."""
+    return [(run, why) for run, why in zip(runs, _why_not(runs), strict=True) if why and has_policy(run)]
+
+
+def _why_not(runs: Sequence[RunData]) -> list[str]:
+    points = [0 if run.failed else len(steps_and_returns(run)[0]) for run in runs]
     under_way = {run.game for run, count in zip(runs, points, strict=True) if count > 1}
-    needed = [2 if run.game in under_way else 1 for run in runs]
-    return [run for run, count, least in zip(runs, points, needed, strict=True) if count >= least]
+    found = []
+    for run, count in zip(runs, points, strict=True):
+        why = ""
+        if run.failed:
+            why = run.ended.reason
+        elif count == 0:
+            why = "not evaluated yet"
+        elif count == 1 and run.game in under_way:
+            why = "has only begun"
+        found.append(why)
+    return found
+
+
+def left_out_text(arm: str, whys: Mapping[int, str], seeds: int) -> str:
+    """Which seeds of an arm are left out: `joint: 1 of 3 seeds left out: has only begun (seed 2)`.
+
+    Args:
+        arm: its name.
+        whys: {seed: why it is left out}, at least one.
+        seeds: how many it has in all.
+    """
+    of: dict[str, list[str]] = {}
+    for seed, why in whys.items():
+        of.setdefault(why, []).append(str(seed))
+    reasons = "; ".join(f"{why} (seed {', '.join(those)})" for why, those in of.items())
+    return f"{arm}: {len(whys)} of {seeds} seed{'' if seeds == 1 else 's'} left out: {reasons}"
 
 
 def check_arms(runs: Sequence[RunData]) -> None:

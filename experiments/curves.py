@@ -71,7 +71,7 @@ def comparison(
         panels: at least one, with at least one line.
         path: of the PNG file.
         title: of the figure.
-        note: below it.
+        note: below it; lines.
         looks: label -> colour and line; None for those that the labels have by themselves.
     """
     columns = min(len(panels), 3)
@@ -82,7 +82,9 @@ def comparison(
     figure = plots.new_figure(width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)
     handles: dict[str, object] = {}
     for i, panel in enumerate(panels):
-        axes = figure.add_subplot(rows, columns, i + 1, xlabel=plots.STEPS_LABEL, ylabel="mean return")
+        axes = figure.add_subplot(
+            rows, columns, i + 1, xlabel=plots.steps_label(panel.title), ylabel="mean return"
+        )
         axes.set_title(panel.title, fontsize=10, parse_math=False)
         end = max((max(line.steps) for line in panel.lines if len(line.steps)), default=1)
         for line in panel.lines:
@@ -114,7 +116,7 @@ def comparison(
 
         del handles[known]
         handles[known] = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
-    notes = [note] if note else []
+    notes = note.splitlines()
     for panel in panels:
         shown = [x._replace(method=f"{x.method} policy") for x in panel.policies] + list(panel.levels)
         notes += [f"{panel.title}, {x.method}, {x.score:g}: {x.differs}" for x in shown if x.differs]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from experiments.plots import COLOURS, STEPS_LABEL, count_axis, log_axis, new_figure, save
+from experiments.plots import COLOURS, count_axis, log_axis, new_figure, save, steps_label
 from srl_jax.diagnostics import rows as of_rows
 
 WRITTEN_IN = 11
@@ -65,8 +65,10 @@ def drift_matrix(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike, tit
     return save(figure, path)
 
 
-def diagnostics(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, title: str) -> Path | None:
-    """Draws the numbers among a run's diagnostics against env steps, a panel for each kind.
+def diagnostics(
+    rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, title: str, game: str = ""
+) -> Path | None:
+    """Draws the numbers among a run's diagnostics against env steps of its game, a panel for each kind.
 
     Returns:
         The path, or None if there are none (nothing is written then).
@@ -94,7 +96,7 @@ def diagnostics(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, titl
         count_axis(axes)
         axes.tick_params(labelsize=7)
         if i + columns >= len(panels):
-            axes.set_xlabel(STEPS_LABEL, fontsize=8)
+            axes.set_xlabel(steps_label(game), fontsize=8)
     return save(figure, path)
 
 

@@ -1,13 +1,15 @@
-"""Run directories: new ones, ones to overwrite, ones to go on from; one writer at a time."""
+"""Run directories: new ones, ones to overwrite, to go on from, to be read; one writer at a time."""
 
 import contextlib
+import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from experiments import flags as config_flags
-from srl_jax import checkpoint, rundir
+from srl_jax import checkpoint, ending, rundir
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import PARTIAL, Config, difference, told_to_xla
 from srl_jax.errors import ConfigError, SaveError
@@ -18,6 +20,53 @@ from srl_jax.reading import SETTINGS, parse_json, read_bytes
 def say(line: str) -> None:
     """A line for whoever watches, on stderr."""
     print(f"resume: {line}", file=sys.stderr)
+
+
+def runs_below(root: Path) -> list[Path]:
+    """Directories with a config.json in or below another; links are followed: a run may lie elsewhere.
+
+    Each is found once: by its own path where that is below, else by the first link to it. A link to what the
+    link or the root lies in is not followed.
+
+    Returns:
+        As `natural` sorts them.
+
+    Raises:
+        ConfigError: a directory cannot be read.
+    """
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):  # removed meanwhile, by a run that goes on
+            raise ConfigError(f"{error.filename}: {error.strerror}")
+
+    found: list[str] = []
+    seen: set[str] = set()
+    waiting = [os.fspath(root)]
+    while waiting:
+        links: list[str] = []
+        for top in waiting:
+            for folder, folders, files in os.walk(top, onerror=refuse):
+                real = os.path.realpath(folder)
+                if real in seen:
+                    folders.clear()
+                    continue
+                seen.add(real)
+                if "config.json" in files and os.path.isfile(os.path.join(folder, "config.json")):
+                    found.append(folder)
+                paths = [os.path.join(folder, name) for name in folders]
+                links += [path for path in paths if os.path.islink(path) and not _around(path, real, root)]
+        waiting = sorted(links, key=natural)
+    return [Path(folder) for folder in sorted(found, key=natural)]
+
+
+def _around(link: str, *places: str | Path) -> bool:
+    """Whether a link leads to a directory in which one of the places lies."""
+    return any(Path(os.path.realpath(place)).is_relative_to(os.path.realpath(link)) for place in places)
+
+
+def natural(text: str) -> list:
+    """A key for sorting names with numbers in them by these: seed2 before seed10."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", text))]
 
 
 def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:
@@ -52,7 +101,11 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
                 f"--out={out}: not empty; name a new directory, or --resume=auto goes on with the run, "
                 "or --overwrite deletes it"
             )
-        if path.is_symlink() or not _is_run(path):
+        if path.is_symlink():
+            raise ConfigError(
+                f"--out={out}: a link, so --overwrite does not delete it; name what it leads to"
+            )
+        if not _is_run(path):
             raise ConfigError(f"--out={out}: not a run directory, so --overwrite does not delete it")
     except OSError as error:
         raise ConfigError(f"--out={out}: {error.strerror}") from None
@@ -163,6 +216,9 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
         return None
     if differing := difference(manifest.config, config):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
+    with contextlib.suppress(ConfigError):  # it informs and decides nothing
+        if (ended := ending.read(path)) is not None and ended.status == "diverged":
+            say(f"{path}: ended since {ended.reason}; the same code on the same machine gets there again")
     about = parse_json(read_bytes(path / "config.json", SETTINGS))
     then, now = about.get("environment"), told_to_xla()
     if then != now:

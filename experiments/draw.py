@@ -55,11 +55,14 @@ def draw_run(
     rows = read_rows(run / "metrics.jsonl")
     figures = run / "figures"
     title = f"{config.game}, {config.mode}, {config.encoder.partition(':')[0]}, seed {config.seed}"
-    reference = _reference(config, thesis) if thesis else None
-    policies = {name: row.return_mean for name, row in reference_policies(config.game).items()}
-    curve = plots.learning_curve(rows, figures / "learning_curve.png", title, reference, policies)
-    written = [curve, plots.losses(rows, figures / "losses.png")]
-    written.append(diagnostic_plots.diagnostics(rows, figures / "diagnostics.png", title))
+    reference, game = _reference(config, thesis) if thesis else None, config.game
+    policies = {name: row.return_mean for name, row in reference_policies(game).items()}
+    curve = figures / "learning_curve.png"
+    written = [
+        plots.learning_curve(rows, curve, title, reference, policies, game),
+        plots.losses(rows, figures / "losses.png", game),
+        diagnostic_plots.diagnostics(rows, figures / "diagnostics.png", title, game),
+    ]
     written.append(diagnostic_plots.drift_matrix(rows, figures / "drift.png", title))
     for name, (inputs, targets, outputs) in (pictures or {}).items():
         path = figures / f"{name}.png"

@@ -72,7 +72,8 @@ def evaluated(
 
     Args:
         figure: its first arm is the baseline.
-        runs: on disk; those of other arms and games are left out, and those that are not `comparable`.
+        runs: on disk; those of other arms and games are left out, and those that are not `comparable`, of
+            which it is said.
         games: in this order.
         methods: whose published scores are given, with what differs.
         force: compare runs of different protocols, and say what differs.
@@ -82,8 +83,8 @@ def evaluated(
         ConfigError: runs cannot be compared.
     """
     names = [arm.name for arm in figure.arms]
-    runs = [run for run in runs if run.arm in names and run.game in games and len(steps_and_returns(run)[0])]
-    collect.check_arms(runs)
+    runs = [run for run in runs if run.arm in names and run.game in games]
+    collect.check_arms([run for run in runs if len(steps_and_returns(run)[0])])
     forced = collect.check_protocols(runs, force=force)
     groups = collect.grouped(comparable(runs))
     result: dict[str, Any] = {
@@ -95,6 +96,10 @@ def evaluated(
         "styles": {name: list(style) for name, style in styles(names, among).items()},
         "level": 0.95,
         "forced": forced,
+        "left_out": [
+            {"game": run.game, "arm": run.arm, "seed": run.seed, "reason": why}
+            for run, why in collect.left_out(runs)
+        ],
         "games": {},
     }
     for game in games:
@@ -195,7 +200,20 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
     if numbers["forced"]:
         note += "; PROTOCOLS DIFFER between runs"
     looks = {arm: tuple(style) for arm, style in numbers["styles"].items()}
+    note = "\n".join([note, *left_out_lines(numbers)])
     return curves.comparison(panels, path, f"{figure.name}  {figure.title}", note, looks)
+
+
+def left_out_lines(numbers: Mapping[str, Any]) -> list[str]:
+    """A line for each arm on a game of which seeds are left out, from what `evaluated` gave."""
+    whys: dict[tuple[str, str], dict[int, str]] = {}
+    for run in numbers.get("left_out", ()):
+        whys.setdefault((run["game"], run["arm"]), {})[run["seed"]] = run["reason"]
+    lines = []
+    for (game, arm), seeds in whys.items():
+        there = numbers["games"].get(game, {"arms": {}})["arms"].get(arm, {"seeds": ()})
+        lines.append(f"{game}, {collect.left_out_text(arm, seeds, len(seeds) + len(there['seeds']))}")
+    return lines
 
 
 def _limits(interval: statistics.Interval) -> dict[str, Any]:
@@ -296,7 +314,8 @@ def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directo
     """
     numbers = evaluated(figure, runs, games, **how)
     if not numbers["games"]:
-        raise ConfigError(f"no evaluation of any arm of figure {figure.name} in {directory.parent}")
+        why = "".join(f"; {line}" for line in left_out_lines(numbers))
+        raise ConfigError(f"no evaluation of any arm of figure {figure.name} in {directory.parent}{why}")
     directory.mkdir(exist_ok=True)
     (directory / f"{figure.name}.json").write_text(json.dumps(numbers, indent=1) + "\n")
     return draw(figure, numbers, directory / f"{figure.name}.png")

@@ -3,7 +3,6 @@
 Flags are defined here, for the entry points, and nowhere else in the library. Imports no jax.
 """
 
-import difflib
 import functools
 import logging
 import os
@@ -238,7 +237,7 @@ def parse(
     Args:
         argv: the program's name and its arguments.
         values: where the flags are defined.
-        positional: a flag whose value may be given without its name; None for none.
+        positional: a flag whose value, or values, may be given without its name; None for none.
 
     Returns:
         [the program's name].
@@ -251,10 +250,12 @@ def parse(
     try:
         rest = values(argv)
         if positional and len(rest) > 1 and not values[positional].present:
-            values[positional].parse(rest.pop(1))
+            several = isinstance(values[positional], flags.MultiFlag)
+            values[positional].parse(rest[1:] if several else rest[1])
+            del rest[1 : None if several else 2]
     except flags.UnrecognizedFlagError as error:
-        near = difflib.get_close_matches(error.flagname, list(values), n=1, cutoff=0.6)
-        suggestion = f"did you mean --{near[0]}? " if near else ""
+        near = specs.near(error.flagname, values)
+        suggestion = f"did you mean {' or '.join(f'--{name}' for name in near)}? " if near else ""
         fail(f"--{error.flagname}: no such flag; {suggestion}--helpfull lists them all")
     except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
         fail(str(error).removeprefix("flag "))

@@ -12,12 +12,19 @@ from typing import Any
 
 import numpy as np
 
-STEPS_LABEL = "env steps (4 frames each)"
+from srl_jax.envs import ATARI_57
+
+STEPS_LABEL = "env steps"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette: distinguishable to colour-blind readers."""
 MAX_EXAMPLES = 6
 NEAR = 0.02
 """Of an axis: reference policies that are as near to each other as that share a line."""
+
+
+def steps_label(game: str) -> str:
+    """Of an axis of env steps: an Atari game has several frames in one."""
+    return f"{STEPS_LABEL} (4 frames each)" if game in ATARI_57 else STEPS_LABEL
 
 
 def available() -> bool:
@@ -31,6 +38,7 @@ def learning_curve(
     title: str,
     reference: Sequence[tuple[str, Sequence[float], Sequence[float]]] | None = None,
     policies: Mapping[str, float] | None = None,
+    game: str = "",
 ) -> Path | None:
     """Draws the mean evaluation return, and the worst to the best game, against env steps.
 
@@ -41,6 +49,7 @@ def learning_curve(
         reference: other curves, (label, env steps, mean returns) each, drawn dashed and only as far
             as the run goes: curves are compared at equal steps.
         policies: see `levels`.
+        game: the run's, for what an env step is.
 
     Returns:
         The path, or None if there is no evaluation to draw (then nothing is written).
@@ -54,7 +63,7 @@ def learning_curve(
     counts = sorted({len(game) for game in games if np.isfinite(game).all()})
 
     figure = new_figure(6.4, 4.0)
-    axes = figure.add_subplot(xlabel=STEPS_LABEL)
+    axes = figure.add_subplot(xlabel=steps_label(game))
     axes.set_title(title, parse_math=False)
     over = f" over {' or '.join(map(str, counts))} games" if counts else ""
     axes.set_ylabel("mean return" + over)
@@ -85,7 +94,7 @@ def learning_curve(
     return save(figure, path)
 
 
-def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path | None:
+def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, game: str = "") -> Path | None:
     """Draws every `loss/NAME` of the train rows in a panel of its own, and the gradient norm.
 
     The vertical axis is logarithmic where all values are positive and span a factor of 5 or more.
@@ -130,7 +139,7 @@ def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike) -> Path |
         count_axis(axes)
         axes.tick_params(labelsize=7)
         if i + columns >= len(curves):
-            axes.set_xlabel(STEPS_LABEL, fontsize=8)
+            axes.set_xlabel(steps_label(game), fontsize=8)
     return save(figure, path)
 
 

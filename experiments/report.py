@@ -1,7 +1,8 @@
 """One self-contained page about many runs: `python -m experiments.report runs/ --out=report.html`.
 
 What was run, figures, statistics with intervals, learning curves, what the agents do and see, diagnostics,
-cost, and every difference between the arms. It opens offline.
+cost, and every difference between the arms. It opens offline. Several directories are compared with each
+other: `python -m experiments.report runs/a runs/b --out=report.html`.
 """
 
 import os
@@ -18,8 +19,11 @@ FLAGS = flags.FLAGS
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_string(
-        "runs", None, "directory in or below which the runs are; the name may be left out", flag_values=values
+    flags.DEFINE_multi_string(
+        "runs",
+        None,
+        "directory in or below which the runs are, or several; the name may be left out",
+        flag_values=values,
     )
     flags.DEFINE_string("out", None, "file to write, must end in .html", flag_values=values)
     flags.DEFINE_boolean("overwrite", False, "replace the file if there is one", flag_values=values)
@@ -112,14 +116,15 @@ def report(values: flags.FlagValues) -> Path:
         raise ConfigError("--runs: missing; name a directory of runs, python -m experiments.report runs/")
     path = check_out(values["out"].value, overwrite=values["overwrite"].value)
     reach = check_reach(values["reach"].value)
-    if not Path(runs).is_dir():
-        raise ConfigError(f"--runs={runs}: no such directory")
+    for root in runs:
+        if not Path(root).is_dir():
+            raise ConfigError(f"--runs={root}: no such directory")
     if not plots.available():
         raise ConfigError("the pictures of a report need matplotlib and Pillow: pip install 'srl-jax[plots]'")
     from experiments.reporting import page
 
     same = {name: values[name].value for name in ("baseline", "force", "finished_only", "media")}
-    write(path, page.build(runs, reach=reach, **same))
+    write(path, page.build(*runs, reach=reach, **same))
     return path
 
 

@@ -20,6 +20,8 @@ import tempfile
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 
+from experiments import control_groups
+
 GUARD = "SRL_JAX_RUNTIME"
 """Set in the process that `prepare` started; such a process is not started again."""
 
@@ -108,8 +110,10 @@ def has_gpu(env: Mapping[str, str], device: str = "/dev/nvidia0") -> bool:
 
 
 def cores() -> int:
-    """How many this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """How many this process may use, by its affinity and the time that its control groups allow."""
+    mine = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    allowed = control_groups.cores()
+    return mine if allowed is None else min(mine, allowed)
 
 
 def machine() -> str:

@@ -246,7 +246,13 @@ def dry_run(
         if unknown and seconds:
             line += f" and {unknown} runs of unknown speed"
         line += f"; speeds: {'; '.join(sorted(sources))}"
-    return [*lines, line]
+    lines.append(line)
+    if total[1] and unknown:
+        lines.append(
+            "unknown: no run of this game's kind, encoder and mode has been timed, here or among published "
+            "ones; start the sweep, and a few minutes later --status says how long it takes"
+        )
+    return lines
 
 
 def chosen_runs(values: flags.FlagValues, root: Path) -> list[Planned]:

@@ -136,7 +136,7 @@ def save(
         about["config"] = json.loads(config.to_json())
         sign(temporary, about)
         _put_in_place(temporary, final)
-        up_to_this = [p for p in _all(home) if p.name <= final.name]
+        up_to_this = [p for p in _all(home) if int(p.name) <= env_steps]
         for old in up_to_this[:-keep] if keep else ():
             aside = home / f".{old.name}.old.partial"
             os.replace(old, aside)  # so that nobody takes one that is half removed for a checkpoint
@@ -349,7 +349,7 @@ def newest_good(run: str | Path, say: Callable[[str], None], at_most: int | None
     """
     problem = None
     folders = _all(Path(run) / "checkpoints")
-    for path in reversed([f for f in folders if at_most is None or f.name <= f"{at_most:09d}"]):
+    for path in reversed([f for f in folders if at_most is None or int(f.name) <= at_most]):
         if problem:
             say(f"{problem}; going on from the one before, {path.name}")
         try:
@@ -534,6 +534,17 @@ def load_into(template: Any, tree: Any, what: str) -> Any:
     return jax.tree.unflatten(jax.tree.structure(template), jax.tree.leaves(restored))
 
 
+def is_part(template: Any, tree: Any) -> bool:
+    """Whether a tree from `load` holds a part of a template's parameters, and nothing else."""
+    from flax import serialization
+
+    whole, found = (
+        {name for name, x in _flat(branch).items() if not isinstance(x, dict)}
+        for branch in (serialization.to_state_dict(template), tree)
+    )
+    return found < whole
+
+
 def _flat(tree: Any, path: str = "") -> dict[str, Any]:
     """{path: leaf} of nested dicts, as ['encoder']['kernel']; an empty dict is a leaf."""
     if not isinstance(tree, dict) or not tree:
@@ -589,7 +600,8 @@ def _same(flag: str, config: Config, found: Config, field: str, what: str) -> No
 
 def _all(folder: Path) -> list[Path]:
     """The checkpoints of a folder, oldest first; whether they are whole, their manifests tell."""
-    return sorted(p for p in folder.glob("[0-9]*") if p.is_dir())
+    found = [p for p in folder.glob("[0-9]*") if re.fullmatch("[0-9]+", p.name) and p.is_dir()]
+    return sorted(found, key=lambda p: int(p.name))  # names have 9 digits, but more from a billion steps on
 
 
 def _about(entry: Entry) -> dict[str, Any]:

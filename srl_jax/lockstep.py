@@ -22,7 +22,7 @@ import numpy as np
 from srl_jax.agent import Agent, make_agent
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config
-from srl_jax.loop import Result, Run, make_env
+from srl_jax.loop import Result, make_env, train
 from srl_jax.types import Params
 
 
@@ -61,8 +61,8 @@ def train_seeds(
         finished = False
         try:
             shown, manifest = progress and i == 0, resume[i] if resume else None
-            run = Run(configs[i], Path(outs[i]), shown, lockstep.agents[i], resume=manifest, stop=stop)
-            result = run.train()
+            agent = lockstep.agents[i]
+            result = train(configs[i], outs[i], progress=shown, resume=manifest, stop=stop, agent=agent)
             finished = not result.interrupted
             return result
         finally:

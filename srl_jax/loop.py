@@ -6,6 +6,7 @@ Both work on the parameters and the replay of the step before, and meet before t
 has a thread, too, and is awaited before the next row is written. So no result depends on timing.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable
 from pathlib import Path
@@ -15,17 +16,18 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax import checkpoint, envs, snapshot
+from srl_jax import checkpoint, ending, envs, snapshot
 from srl_jax.actor import FrameStack, Policy, linear, random_policy, seed_for, yielding_thread
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics.measure import Diagnostics
-from srl_jax.errors import ConfigError, Diverged
+from srl_jax.ending import Ending
+from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.evaluator import Evaluator, Moment
 from srl_jax.optim import ENCODER, RL
 from srl_jax.replay import Replay
 from srl_jax.reporting import Report
-from srl_jax.types import Params, Window
+from srl_jax.types import Encoder, Params, Window
 from srl_jax.update import Hyper, make_latents, named_key
 
 PICTURES = 6
@@ -57,8 +59,11 @@ def train(
     progress: bool = True,
     resume: checkpoint.Manifest | None = None,
     stop: Callable[[], bool] = lambda: False,
+    agent: Agent | None = None,
 ) -> Result:
     """Trains one agent, writing `metrics.jsonl` and `checkpoints/` into a run directory that exists.
+
+    How it ended goes to `ended.json`, see `srl_jax.ending`; a ConfigError changes nothing there.
 
     Args:
         config: of the run, resolved.
@@ -68,13 +73,25 @@ def train(
             `srl_jax.checkpoint.verify`; what follows is what would have followed had the run not ended there.
         stop: asked after each step; once it says so, a checkpoint is written and training ends. A
             KeyboardInterrupt instead, in the middle of a step, leaves the last checkpoint.
+        agent: of this configuration, where it is made already.
 
     Raises:
         ConfigError: a spec or a checkpoint to start from does not fit.
         Diverged: a loss is no longer finite; the last checkpoint is from before.
         SaveError: something could not be written; the last checkpoint is whole.
     """
-    return Run(config, Path(out), progress, resume=resume, stop=stop).train()
+    out, run = Path(out), None
+    try:
+        run = Run(config, out, progress, agent, resume=resume, stop=stop)
+        result = run.train()
+    except ConfigError:
+        raise
+    except BaseException as error:
+        with contextlib.suppress(SaveError):  # what ended the run is what is told
+            ending.write(out, ending.of(error, run.env_steps if run else 0))
+        raise
+    ending.write(out, Ending("stopped" if result.interrupted else "finished", result.env_steps))
+    return result
 
 
 def greedy_policy(agent: Agent, params: Any, key: jax.Array) -> Policy:
@@ -111,16 +128,47 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
     """An agent, its parameters and the manifest of a checkpoint or of a run's newest one.
 
     Raises:
+        srl_jax.errors.ConfigError: there is none, it is damaged, does not fit this code, or it is an encoder
+            that was kept alone, see `load_encoder`.
+    """
+    manifest = checkpoint.read_manifest(path)
+    agent, template = _agent_of(manifest)
+    tree = checkpoint.load(manifest)
+    if checkpoint.is_part(template, tree):
+        raise ConfigError(
+            f"{manifest.path}: a kept encoder, without a policy; name the run or one of its checkpoints "
+            "(srl_jax.loop.load_encoder and --encoder_from take kept encoders)"
+        )
+    return agent, checkpoint.load_into(template, tree, str(manifest.path)), manifest
+
+
+def load_encoder(path: str | Path) -> tuple[Encoder, Params, checkpoint.Manifest]:
+    """The encoder of a run, of one of its checkpoints, or one that was kept, `RUN/encoders/ENV_STEPS`.
+
+        encoder, params, manifest = load_encoder("runs/pong/encoders/000002000")
+        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S] -> float32 [B, encoder.features]
+
+    Raises:
         srl_jax.errors.ConfigError: there is none, it is damaged, or does not fit this code.
     """
     manifest = checkpoint.read_manifest(path)
+    encoder = _agent_of(manifest)[0].encoder
+    return encoder, _encoder_params(encoder, manifest, str(manifest.path)), manifest
+
+
+def _agent_of(manifest: checkpoint.Manifest) -> tuple[Agent, Any]:
+    """The agent of a checkpoint's configuration, and the shapes of its parameters."""
     try:
         agent = make_agent(manifest.config, manifest.num_actions)
-        template = agent.shapes().params
+        return agent, agent.shapes().params
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{manifest.path}: {error}") from None
-    params = checkpoint.load_into(template, checkpoint.load(manifest), str(manifest.path))
-    return agent, params, manifest
+
+
+def _encoder_params(encoder: Encoder, manifest: checkpoint.Manifest, what: str) -> Params:
+    """A checkpoint's encoder in the form of this one; `what` names it in errors."""
+    template = jax.eval_shape(encoder.init, jax.random.key(0))
+    return checkpoint.load_into(template, checkpoint.load(manifest)["encoder"], what)
 
 
 class Run:
@@ -195,6 +243,7 @@ class Run:
         finished = False
         try:
             with self.report, self.env_thread, self.evaluator:
+                ending.clear(self.out)
                 try:
                     finished = self.run()
                 except (KeyboardInterrupt, BrokenBarrierError):  # the latter where another seed was the first

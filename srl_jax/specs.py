@@ -9,7 +9,8 @@ import dataclasses
 import difflib
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping
+import re
+from collections.abc import Callable, Iterable, Mapping, Set
 from typing import Any, NamedTuple
 
 from srl_jax.errors import ConfigError
@@ -56,11 +57,18 @@ class Spec:
 
 def choices_text(given: str, names: Iterable[str]) -> str:
     """`did you mean X? valid: ...`; suggests only where a name is near (letter case aside)."""
-    names = list(names)
-    lowered = {name.lower(): name for name in names}
-    near = difflib.get_close_matches(given.lower(), lowered, n=1, cutoff=0.6)
-    suggestion = f"did you mean {lowered[near[0]]}? " if near else ""
+    names = sorted(names) if isinstance(names, Set) else list(names)
+    close = near(given, names)
+    suggestion = f"did you mean {close[0]}? " if close else ""
     return f"{suggestion}valid: {', '.join(names)}"
+
+
+def near(given: str, names: Iterable[str], most: int = 5) -> list[str]:
+    """The names that may have been meant: spelt nearly so, then those with it as a word, as lr in lr_rl."""
+    lowered = {name.lower(): name for name in sorted(names)}
+    found = difflib.get_close_matches(given.lower(), lowered, n=most, cutoff=0.6)
+    found += [name for name in lowered if given.lower() in re.split("[^a-z0-9]", name)]
+    return [lowered[name] for name in dict.fromkeys(found)][:most]
 
 
 def parse_value(text: str, kind: type) -> bool | int | float | str:

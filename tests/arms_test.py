@@ -73,13 +73,24 @@ def test_a_figure_of_ones_own(tmp_path):
     [
         ({"name": "../x"}, "name '../x': letters"),
         ({"arms": []}, "the figure has no 'arms'"),
-        ({"arm": []}, "the figure has no did you mean arms"),
+        ({"arm": []}, "the figure has no 'arm'; did you mean arms?"),
         ({"title": 3}, "title of the figure is not of type str"),
         ({"arms": ["a"]}, "arm 1 is not a JSON object"),
         ({"arms": [{"name": "a"}]}, "arm 1 has no 'preset'"),
-        ({"arms": [{"name": "a", "preset": "catch/join"}]}, "preset of arm 1: did you mean catch/joint"),
+        (
+            {"arms": [{"name": "a", "preset": "catch/join"}]},
+            "arm 1: no preset 'catch/join'; did you mean catch/joint",
+        ),
         ({"arms": [GOOD["arms"][0]] * 2}, "two arms have the same name"),
-        ({"arms": [{**GOOD["arms"][0], "flags": {"srl_evry": 4}}]}, "flag of arm 1: did you mean srl_every"),
+        (
+            {"arms": [{**GOOD["arms"][0], "flags": {"srl_evry": 4}}]},
+            "arm 1: no flag 'srl_evry'; did you mean srl_every",
+        ),
+        (
+            {"arms": [{**GOOD["arms"][0], "flags": {"lr": 1}}]},
+            "arm 1: no flag 'lr'; did you mean lr_encoder or lr_encoder_srl or lr_final or lr_rl or lr_srl? python -m",
+        ),
+        ({"arms": [{**GOOD["arms"][0], "flags": {"qqq": 1}}]}, "arm 1: no flag 'qqq'; python -m experiments"),
         (
             {"arms": [{**GOOD["arms"][0], "flags": {"srl_every": None}}]},
             "flag srl_every of arm 1: not a text",
@@ -92,6 +103,12 @@ def test_a_bad_figure_is_refused_by_name(tmp_path, change, told):
     with pytest.raises(ConfigError) as error:
         arms.figures_named(str(path))
     assert str(error.value).startswith(f"--figure={path}: {told}") and "\n" not in str(error.value)
+
+
+def test_options_of_rl_are_flags_of_an_arm_as_well(tmp_path):
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({**GOOD, "arms": [{**GOOD["arms"][0], "flags": {"n_step": 5}}]}))
+    assert arms.read_figure(path).arms[0].flags == {"n_step": "5"}
 
 
 def test_no_file_and_no_json_are_refused(tmp_path):

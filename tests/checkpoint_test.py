@@ -213,6 +213,17 @@ def test_the_newest_is_read_and_two_are_kept(tmp_path):
     assert names(tmp_path / "checkpoints") == ["000300001"]
 
 
+def test_the_newest_is_that_of_the_most_steps_however_many_digits_they_have(tmp_path):
+    for env_steps in (999_999_000, 999_999_999, 1_000_000_998):
+        write(tmp_path, env_steps=env_steps)
+    assert checkpoint.read_manifest(tmp_path).env_steps == 1_000_000_998
+    assert newest_good(tmp_path)[0].env_steps == 1_000_000_998
+    assert newest_good(tmp_path, at_most=1_000_000_000)[0].env_steps == 999_999_999
+    assert names(tmp_path / "checkpoints") == ["1000000998", "999999999"]
+    (tmp_path / "checkpoints/2000000000 copy").mkdir()  # no checkpoint
+    assert checkpoint.read_manifest(tmp_path).env_steps == 1_000_000_998
+
+
 def test_what_was_just_written_is_kept_however_many_are_newer(tmp_path):
     # Where they are damaged, a run has gone on from before them.
     for env_steps in (1000, 2000, 3000, 4000):

@@ -4,8 +4,9 @@ import pytest
 
 from experiments import collect
 from srl_jax.config import Config
+from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
-from tests.helpers import write_run
+from tests.helpers import NOT_FINITE, write_run
 
 
 def test_runs_are_found_and_grouped(tmp_path):
@@ -30,6 +31,67 @@ def test_no_run_and_the_same_run_twice_are_refused(tmp_path):
     write_run(tmp_path / "y/a/seed0")
     with pytest.raises(ConfigError, match="the same game, arm and seed"):
         collect.load_runs(tmp_path)
+
+
+def test_linked_runs_have_the_name_of_the_link(tmp_path):
+    for seed in (0, 1, 10):
+        write_run(tmp_path / f"disk/joint_seed{seed}", seed=seed)
+    write_run(tmp_path / "cmp/arm10/seed0")
+    write_run(tmp_path / "cmp/arm9/seed0")
+    (tmp_path / "cmp/joint").mkdir()
+    (tmp_path / "cmp/joint/seed0").symlink_to(tmp_path / "disk/joint_seed0")
+    (tmp_path / "cmp/other_seed1").symlink_to(tmp_path / "disk/joint_seed1")
+    (tmp_path / "cmp/joint_seed10").symlink_to(tmp_path / "disk/joint_seed10")
+    found = [(run.arm, run.seed) for run in collect.load_runs(tmp_path / "cmp")]
+    assert found == [("arm9", 0), ("arm10", 0), ("joint", 0), ("joint", 10), ("other", 1)]
+
+
+def test_several_directories_are_read_as_one(tmp_path):
+    for name in ("x/a/seed0", "y/b_seed0", "z"):
+        write_run(tmp_path / name)
+    (tmp_path / "y/again_seed0").symlink_to(tmp_path / "x/a/seed0")
+    places = [tmp_path / "x", tmp_path / "y", tmp_path / "z", tmp_path / "x/a"]
+    assert [run.arm for run in collect.load_runs(*places)] == ["a", "b", "z"]
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ConfigError, match="empty: no run directory"):
+        collect.load_runs(tmp_path / "x", tmp_path / "empty")
+
+
+def test_the_arm_of_the_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(write_run(tmp_path / "joint/seed0"))
+    assert [run.arm for run in collect.load_runs(".")] == ["joint"]
+    monkeypatch.chdir(write_run(tmp_path / "alone_seed3"))
+    assert [run.arm for run in collect.load_runs(".")] == ["alone"]
+
+
+def test_a_run_that_failed_is_neither_compared_nor_under_way(tmp_path):
+    write_run(tmp_path / "a/seed0", (0, 1, 2))
+    write_run(tmp_path / "a/seed1", (0,), seed=1, ended=NOT_FINITE)
+    write_run(tmp_path / "a/seed2", (0, 1), seed=2, ended=NOT_FINITE)
+    write_run(tmp_path / "b/seed0", (0, 1, 2), ended=Ending("finished", 200))
+    write_run(tmp_path / "b/seed1", (0, 1), seed=1, ended=Ending("stopped", 100))
+    write_run(tmp_path / "b/seed2", (0,), seed=2)
+    write_run(tmp_path / "b/seed3", (), seed=3)
+    write_run(tmp_path / "c/seed0", (), mode="pretrain")
+    runs = collect.load_runs(tmp_path)
+    assert [(run.arm, run.seed) for run in collect.comparable(runs)] == [("a", 0), ("b", 0), ("b", 1)]
+    left = {(run.arm, run.seed): why for run, why in collect.left_out(runs)}
+    assert left == {
+        ("a", 1): NOT_FINITE.reason,
+        ("a", 2): NOT_FINITE.reason,
+        ("b", 2): "has only begun",
+        ("b", 3): "not evaluated yet",
+    }
+    # One that failed says nothing of how far the others of its game are.
+    alone = [run for run in runs if run.seed == 2]
+    assert [(run.arm, run.seed) for run in collect.comparable(alone)] == [("b", 2)]
+
+
+def test_what_is_left_out_is_said_in_a_line():
+    assert collect.left_out_text("a", {2: "x"}, 3) == "a: 1 of 3 seeds left out: x (seed 2)"
+    assert collect.left_out_text("a", {0: "x"}, 1) == "a: 1 of 1 seed left out: x (seed 0)"
+    text = collect.left_out_text("a", {0: "x", 1: "y", 2: "x"}, 3)
+    assert text == "a: 3 of 3 seeds left out: x (seed 0, 2); y (seed 1)"
 
 
 def test_runs_of_an_arm_differ_in_their_seed_alone(tmp_path):

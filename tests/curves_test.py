@@ -28,10 +28,11 @@ def drawn(monkeypatch):
 
 def test_every_game_has_a_panel_and_an_arm_one_colour(drawn, tmp_path):
     thesis = ([0, 150, 300], [1.0, 4.0, 10.0])
-    panels = [_panel("Pong", a=(1.0, None), b=(2.0, thesis)), _panel("Qbert", b=(5.0, None))]
-    curves.comparison(panels, tmp_path / "x.png", "title")
+    panels = [_panel("Pong", a=(1.0, None), b=(2.0, thesis)), _panel("Catch", b=(5.0, None))]
+    curves.comparison(panels, tmp_path / "x.png", "title", "one\ntwo")
     first, second = drawn[0].axes
-    assert [axes.get_title() for axes in (first, second)] == ["Pong", "Qbert"]
+    assert [axes.get_title() for axes in (first, second)] == ["Pong", "Catch"]
+    assert first.get_xlabel() == "env steps (4 frames each)" and second.get_xlabel() == "env steps"
     solid = {line.get_ydata()[0]: line.get_color() for line in first.lines if line.get_linestyle() == "-"}
     assert solid[1.0] != solid[2.0]
     assert [line.get_color() for line in second.lines if line.get_linestyle() == "-"] == [solid[2.0]]
@@ -44,7 +45,8 @@ def test_every_game_has_a_panel_and_an_arm_one_colour(drawn, tmp_path):
     told = [text.get_text() for text in legend.get_texts()]
     assert told == ["a (5 seeds)", "b (5 seeds)", "the thesis' own, one run each"]
     assert [text.get_text() for text in first.texts] == ["Human"]
-    assert "Pong, Human, 9: other protocol" in legend.get_title().get_text()
+    told = legend.get_title().get_text().split("\n")
+    assert told[:2] == ["one", "two"] and "Pong, Human, 9: other protocol" in told
 
 
 def test_a_band_is_the_interval(drawn, tmp_path):

@@ -13,7 +13,7 @@ from experiments.reporting.numbers import compare, rows
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
-from tests.helpers import write_run
+from tests.helpers import NOT_FINITE, write_run
 
 FIGURE = Figure("mine", "Mine", "?", (FigureArm("a", "catch/rl_only"), FigureArm("b", "catch/joint")))
 
@@ -88,6 +88,53 @@ def test_a_run_that_has_only_begun_cuts_no_curve(runs):
     assert alone["equal_until"] == 0 and alone["arms"]["a"]["mean"] == [7.0]
 
 
+def test_a_seed_that_failed_cuts_no_curve_and_is_named(runs, tmp_path, drawn_notes):
+    before = _evaluated(runs)
+    write_run(runs / "Catch/a/seed2", (7,), seed=2, ended=NOT_FINITE)
+    write_run(runs / "Catch/a/seed3", (7, 7), seed=3, ended=NOT_FINITE)
+    write_run(runs / "Catch/b/seed3", (0, 0, 0, 0, 0), seed=3, mode="joint", ended=NOT_FINITE)
+    write_run(runs / "Catch/b/seed4", (), seed=4, mode="joint")
+    after = _evaluated(runs)
+    assert after["games"] == before["games"] and before["left_out"] == []
+    assert after["left_out"][0] == {"game": "Catch", "arm": "a", "seed": 2, "reason": NOT_FINITE.reason}
+    assert [(run["arm"], run["seed"]) for run in after["left_out"]] == [
+        ("a", 2),
+        ("a", 3),
+        ("b", 3),
+        ("b", 4),
+    ]
+    lines = [
+        f"Catch, a: 2 of 4 seeds left out: {NOT_FINITE.reason} (seed 2, 3)",
+        f"Catch, b: 2 of 5 seeds left out: {NOT_FINITE.reason} (seed 3); not evaluated yet (seed 4)",
+    ]
+    figures.draw(FIGURE, json.loads(json.dumps(after)), tmp_path / "x.png")
+    assert len(drawn_notes) == 1 and drawn_notes[0][1:] == lines
+
+
+def test_an_arm_of_which_all_seeds_failed_is_listed(runs, tmp_path):
+    (runs / "alone").mkdir()
+    for seed in (0, 1):
+        write_run(runs / f"alone/Catch/a/seed{seed}", (-1, 0), seed=seed, ended=NOT_FINITE)
+    with pytest.raises(
+        ConfigError, match="no evaluation .*; Catch, a: 2 of 2 seeds left out: loss/rl is not f"
+    ):
+        figures.write(FIGURE, collect.load_runs(runs / "alone"), ["Catch"], tmp_path / "figures")
+    write_run(runs / "alone/Catch/b/seed0", (0, 1), mode="joint")
+    numbers = _evaluated(runs / "alone")
+    assert list(numbers["games"]["Catch"]["arms"]) == ["b"] and len(numbers["left_out"]) == 2
+    (line,) = figures.left_out_lines(numbers)
+    assert line.startswith("Catch, a: 2 of 2 seeds left out: loss/rl")
+    assert figures.left_out_lines({"games": {}}) == []  # a file of before
+
+
+@pytest.fixture
+def drawn_notes(monkeypatch):
+    """The lines below the figures that would have been drawn."""
+    notes = []
+    monkeypatch.setattr(figures.curves, "comparison", lambda *given: notes.append(given[3].splitlines()))
+    return notes
+
+
 def test_the_report_has_the_same_numbers(tmp_path):
     returns = np.random.default_rng(0).normal(size=(10, 3))
     for i, arm in enumerate("ab"):
@@ -152,7 +199,7 @@ def test_an_arm_has_one_colour_in_all_figures_of_a_directory_and_on_its_page(run
     first, second = (figures.evaluated(x, read, ["Catch"], among=among)["styles"] for x in (FIGURE, other))
     assert first["b"] == second["b"] and len({tuple(x) for x in (first | second).values()}) == 3
     options = {"baseline": "b", "reach": {}, "force": True, "finished_only": False, "media": False}
-    report = page.gather(runs, **options)
+    report = page.gather([runs], **options)
     assert {arm: list(style) for arm, style in report.styles.items()} == first | second
 
 

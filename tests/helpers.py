@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from srl_jax import ending
 from srl_jax.config import Config
+from srl_jax.ending import Ending
 from srl_jax.types import Context, Decoder, Encoder, TrainState, Window
 from srl_jax.window import to_unit
 
@@ -35,6 +37,8 @@ SMALL = {
 }
 JOINT = {"mode": "joint", "objectives": ("reconstruction", "latent_l2")}
 """Settings of short runs: whole ones share what jax compiles, as far as they can."""
+NOT_FINITE = Ending("diverged", 330, "loss/rl is not finite after 330 env steps and 10 updates")
+"""How a run ended that diverged."""
 
 
 def _compiler_options() -> dict:
@@ -157,13 +161,16 @@ def zero_leaves(tree) -> list[str]:
     return [jax.tree_util.keystr(path) for path, x in leaves if not np.any(np.asarray(x))]
 
 
-def write_run(path: Path, returns=(1.0, 2.0), every: int = 100, **values) -> Path:
+def write_run(
+    path: Path, returns=(1.0, 2.0), every: int = 100, ended: Ending | None = None, **values
+) -> Path:
     """A run directory as training leaves it, less its checkpoints: evaluations every so many env steps.
 
     Args:
         path: to make.
         returns: mean return of each evaluation.
         every: env steps between two.
+        ended: how, where it says so.
         **values: fields of its Config.
     """
     path.mkdir(parents=True)
@@ -175,4 +182,6 @@ def write_run(path: Path, returns=(1.0, 2.0), every: int = 100, **values) -> Pat
     ]
     rows.insert(1, {"kind": "train", "env_steps": every // 2, "updates": 0, "wall_s": 0.1})
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    if ended is not None:
+        ending.write(path, ended)
     return path

@@ -7,9 +7,9 @@ import time
 import numpy as np
 import pytest
 
-from srl_jax import checkpoint, loop
+from srl_jax import checkpoint, ending, loop
 from srl_jax.config import Config
-from srl_jax.errors import ConfigError
+from srl_jax.errors import ConfigError, Diverged
 from srl_jax.lockstep import Together, train_seeds
 from srl_jax.metrics import read_metrics, strip_wall
 
@@ -140,7 +140,11 @@ def test_a_seed_keeps_what_it_can_go_on_from_until_all_have_ended(tmp_path, monk
     assert there == [[True, True]] * 2
 
 
-@pytest.mark.parametrize("error", [ConfigError("had enough"), KeyboardInterrupt()], ids=["error", "ctrl-c"])
+@pytest.mark.parametrize(
+    "error",
+    [ConfigError("had enough"), Diverged("loss/rl is not finite; so"), KeyboardInterrupt()],
+    ids=["error", "diverged", "ctrl-c"],
+)
 def test_a_seed_that_ends_early_ends_all(tmp_path, monkeypatch, error):
     original = loop.Run.update
 
@@ -157,9 +161,13 @@ def test_a_seed_that_ends_early_ends_all(tmp_path, monkeypatch, error):
     changes["diagnostics"] = False
     config = Config(**CONFIG | changes)
     run = lambda: train_seeds(config, [0, 1], outs, progress=False)  # noqa: E731
-    if isinstance(error, ConfigError):
-        with pytest.raises(ConfigError, match="had enough"):
+    if not isinstance(error, KeyboardInterrupt):
+        with pytest.raises(type(error), match=str(error)):
             run()
+        if isinstance(error, Diverged):  # the other one has done nothing wrong
+            endings = [ending.read(out) for out in outs]
+            assert [x.status for x in endings] == ["stopped", "diverged"]
+            assert endings[1].reason == "loss/rl is not finite"
         return
     assert [result.interrupted for result in run()] == [True, True]
     manifests = [checkpoint.newest_good(out, pytest.fail) for out in outs]

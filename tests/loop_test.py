@@ -13,12 +13,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from srl_jax import checkpoint, loop
+from srl_jax import checkpoint, ending, loop
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.update import Hyper
-from tests.helpers import JOINT, SMALL
+from tests.helpers import JOINT, SMALL, identical
 
 
 def train(path, progress=False, stop=None, **values):
@@ -312,6 +312,9 @@ def test_a_loss_that_is_nan_ends_the_run_before_another_checkpoint(
     # At once, if the priorities would be set from it, and otherwise when the next row is due.
     assert f"{name} is not finite after {env_steps} env steps" in str(error.value)
     assert "\n" not in str(error.value)
+    told = ending.read(path)
+    assert told.failed and told.env_steps == env_steps
+    assert told.reason == str(error.value).removesuffix("; the checkpoints are from before")
     assert whole(path).env_steps == 88
     rows = read_metrics(path / "metrics.jsonl")
     assert [row["env_steps"] for row in rows if row["kind"] == "train"] == [40, 80]
@@ -352,6 +355,7 @@ def test_a_disk_that_is_full_ends_the_run_and_leaves_the_checkpoint_before(tmp_p
         train(path, checkpoint_every=40)
     monkeypatch.setattr(os, "fsync", fsync)
     assert whole(path).env_steps == 40 and "run.json" in whole(path).files
+    assert ending.read(path).reason.endswith("000000080: not written: No space left on device")
     assert [p.name for p in (path / "checkpoints").iterdir()] == ["000000040"]
 
 
@@ -374,9 +378,67 @@ def test_a_row_that_cannot_be_written_ends_the_run_with_its_threads(tmp_path, mo
 def test_early_stop(tmp_path):
     result = train(tmp_path / "run", stop_at_return=-1.0)
     # Every return is at least -1, the untrained policy's too; it is known before the first row is written.
-    assert result.env_steps == 40
+    assert result.env_steps == 40 and ending.read(tmp_path / "run") == ("finished", 40, "")
     assert checkpoint.read_manifest(tmp_path / "run").env_steps == 40
     assert [row["kind"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl")] == ["eval"]
+
+
+def test_the_encoder_of_a_run_of_a_checkpoint_and_one_that_was_kept(joint):
+    path, _ = joint
+    agent, params, _ = loop.load_agent(path)
+    observations = np.random.default_rng(0).integers(0, 256, (2, 42, 42, 4), dtype=np.uint8)
+    newest = whole(path).path
+    for place in (path, path / "checkpoints", newest):
+        encoder, mine, manifest = loop.load_encoder(place)
+        assert manifest.path == newest and identical(mine, params["encoder"])
+    latents = encoder.apply(mine, observations)
+    assert latents.shape == (2, 8) and identical(
+        latents, agent.encoder.apply(params["encoder"], observations)
+    )
+    kept = path / "encoders" / "000000000"
+    encoder, first, manifest = loop.load_encoder(kept)
+    assert manifest.env_steps == 0 and not identical(encoder.apply(first, observations), latents)
+    # There is no policy to play with in it, wherever it lies.
+    for place in (kept, shutil.copytree(kept, path.parent / "elsewhere")):
+        with pytest.raises(ConfigError, match=f"^{place}: a kept encoder, without a policy; name the run or"):
+            loop.load_agent(place)
+    with pytest.raises(ConfigError, match="no checkpoint there"):
+        loop.load_encoder(path / "figures")
+
+
+def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
+    path, config = tmp_path / "run", Config(**SMALL)
+    asked = itertools.count()
+    assert train(path, checkpoint_every=40, stop=lambda: next(asked) == 15).interrupted
+    assert ending.read(path) == ("stopped", 60, "") and not ending.read(path).failed
+    manifest, rows = whole(path), (path / "metrics.jsonl").read_bytes()
+    # What is refused changes nothing.
+    (path / "metrics.jsonl").write_bytes(b"")
+    with pytest.raises(ConfigError, match="does not begin with the rows"):
+        loop.train(config, path, progress=False, resume=manifest)
+    assert ending.read(path).status == "stopped"
+    (path / "metrics.jsonl").write_bytes(rows)
+    # A run that is under way says nothing, and neither does one that is killed.
+    update, seen = loop.Run.update, []
+
+    def broken(run):
+        seen.append(ending.read(path))
+        if run.env_steps == 100:
+            raise RuntimeError("two\nlines")
+        update(run)
+
+    monkeypatch.setattr(loop.Run, "update", broken)
+    with pytest.raises(RuntimeError):
+        loop.train(config, path, progress=False, resume=manifest)
+    assert ending.read(path) == ("failed", 100, "RuntimeError: two lines") and set(seen) == {None}
+    monkeypatch.setattr(loop.Run, "update", update)
+    loop.train(config, path, progress=False, resume=manifest)
+    assert ending.read(path) == ("finished", 240, "")
+    # So does one that ends before its first step.
+    monkeypatch.setattr(loop, "make_env", lambda *arguments: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        train(tmp_path / "other")
+    assert ending.read(tmp_path / "other") == ("failed", 0, "ZeroDivisionError: division by zero")
 
 
 def test_updates_are_compiled_once(joint):

@@ -13,9 +13,11 @@ from experiments import flags as config_flags
 from experiments import plots, report
 from experiments.collect import RunData
 from experiments.reporting import browser
+from srl_jax import ending
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
+from tests.helpers import NOT_FINITE
 
 pytestmark = pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
 
@@ -93,10 +95,10 @@ class Page(HTMLParser):
         return {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows}
 
 
-def build(runs, **options):
+def build(*runs, **options):
     from experiments.reporting import page
 
-    return page.build(runs, **options)
+    return page.build(*runs, **options)
 
 
 @pytest.fixture(scope="module")
@@ -291,6 +293,20 @@ def test_a_page_of_runs_of_before(tmp_path):
     assert "pretrain" in page.table("Settings on Catch")["field"]
 
 
+def test_what_only_atari_has_is_said_of_atari_alone(tmp_path):
+    from experiments.reporting.configs import protocol_text
+
+    catch, pong = (protocol_text(Config(game=game, frame_size=84)) for game in ("Catch", "Pong"))
+    assert catch == (
+        "10 full games an evaluation, every 100,000 env steps; epsilon 0.005; at most 27,000 env steps a game"
+    )
+    assert pong == catch.replace(
+        "; at most", "; no sticky actions; fewer than 30 no-ops at the start; at most"
+    ) + (", of 4 frames each; in training, a lost life ends the return")
+    labels = [plots.steps_label(game) for game in ("Pong", "CatchDistractor", "")]
+    assert labels == ["env steps (4 frames each)", "env steps", "env steps"]
+
+
 def test_other_protocols_are_refused_or_said(tmp_path):
     write_run(tmp_path / "a/seed0", [0.0, 1.0])
     write_run(tmp_path / "a/seed1", [0.0, 1.0], gamma=0.5, seed=1)
@@ -397,9 +413,10 @@ def test_the_command_line(runs, tmp_path, capsys):
     assert written.startswith("<!doctype html>") and [p.name for p in out.parent.iterdir()] == ["report.html"]
     with pytest.raises(ConfigError, match="exists; .*--overwrite"):
         report.report(parsed(f"--out={out}", f"--runs={runs}"))
-    assert parsed(f"--out={out}", runs)["runs"].value == str(runs)
+    assert parsed(f"--out={out}", runs)["runs"].value == [str(runs)]
+    assert parsed("a", f"--out={out}", "b")["runs"].value == ["a", "b"]
+    assert parsed("--runs=a", "--runs=b")["runs"].value == ["a", "b"]
     for wrong, message in (
-        ([runs, runs], "unexpected argument"),
         ([f"--runs={runs}", runs], "unexpected argument"),
         ([runs, "--ovewrite"], "did you mean --overwrite"),
     ):
@@ -417,6 +434,7 @@ def test_the_command_line(runs, tmp_path, capsys):
         ([".", "--out=a/b\n.html"], "has the character"),
         ([".", "--out=file/a.html"], "not a directory"),
         (["none", "--out=a.html"], "--runs=none: no such directory"),
+        ([".", "none", "--out=a.html"], "--runs=none: no such directory"),
         ([".", "--out=a.html"], "no run directory"),
         ([".", "--out=a.html", "--reach=Pong"], "must be GAME=SCORE"),
         ([".", "--out=a.html", "--reach=Pong=nan"], "must be GAME=SCORE"),
@@ -443,3 +461,70 @@ def test_in_a_browser(runs, text, tmp_path):
     (found,) = browser.render(path, [390])
     lines = " ".join(browser.problems(found))
     assert "wide: <div" in lines and "asks for http://127" in lines and "x is not defined" in lines
+
+
+def test_seeds_that_failed_are_named_and_cut_nothing(tmp_path):
+    diag = {"diag/effective_rank": [1.0, 2.0, 3.0]}
+    for seed in (0, 1):
+        write_run(tmp_path / f"rl/seed{seed}", [0.0, 1.0, 1.0], seed=seed, diag=diag)
+        # It would be the baseline, as its name sorts first.
+        ending.write(write_run(tmp_path / f"bad/seed{seed}", [0.0, 9.0], seed=seed), NOT_FINITE)
+    half = {"mode": "joint", "objectives": ("reconstruction",)}
+    write_run(tmp_path / "half/seed0", [0.0, 1.0, 2.0], diag=diag, **half)
+    ending.write(write_run(tmp_path / "half/seed1", [0.0, 1.0], diag=diag, seed=1, **half), NOT_FINITE)
+    page = Page(build(tmp_path, media=False))
+    assert list(page.table("Statistics of Catch")) == ["arm", "rl", "half", "random policy", "no-op policy"]
+    assert page.table("Statistics of Catch")["half"][1] == "2.00 (no interval)"
+    text = f"Failed, not compared:Catch / bad / seed 0: {NOT_FINITE.reason} Catch / bad / seed 1:"
+    assert text in page.text and "Not finished" not in page.text and "3 of 6 runs" in page.text
+    bad = f"bad: 2 of 2 seeds left out: {NOT_FINITE.reason} (seed 0, 1)"
+    half = f"half: 1 of 2 seeds left out: {NOT_FINITE.reason} (seed 1)"
+    assert f"Not compared:{bad} {half}" in page.text
+    assert f"Catch, {half}." in page.text and f"Catch, {bad}." in page.text  # beside the curves
+    assert page.table("Every run")["Catch / bad / seed 0"][1] == "failed"
+    assert "rl (2 seeds) half (1 seed)" in page.text
+
+
+def test_a_page_of_runs_that_all_failed(tmp_path):
+    ending.write(write_run(tmp_path / "a/seed0", [0.0]), NOT_FINITE)
+    page = Page(build(tmp_path, media=False))
+    assert f"Not compared:a: 1 of 1 seed left out: {NOT_FINITE.reason}" in page.text
+
+
+def test_an_encoder_is_from_an_arm_though_its_run_is_a_link(tmp_path):
+    from experiments.collect import load_runs
+    from experiments.reporting import numbers
+
+    write_run(tmp_path / "disk/Catch/source/seed0", mode="pretrain")
+    write_run(
+        tmp_path / "cmp/frozen_seed0", [0.0], mode="frozen", encoder_from="/gone/disk/Catch/source/seed0"
+    )
+    (tmp_path / "cmp/mine_seed0").symlink_to(tmp_path / "disk/Catch/source/seed0")
+    runs = load_runs(tmp_path / "cmp")
+    assert {cost.arm: cost.source for cost in numbers.costs(runs, ["frozen", "mine"], None)} == {
+        "frozen": "mine",
+        "mine": "",
+    }
+
+
+def test_runs_of_several_directories_are_on_one_page(tmp_path, monkeypatch):
+    write_run(tmp_path / "one/fast_seed0", [0.0, 1.0])
+    write_run(tmp_path / "two/runs/slow", [0.0, 0.5], mode="joint", objectives=("reconstruction",))
+    page = Page(build(tmp_path / "one", tmp_path / "two/runs/slow", media=False))
+    assert list(page.table("Statistics of Catch")) == ["arm", "fast", "slow", "random policy", "no-op policy"]
+    places = {name: row[-1] for name, row in page.table("Every run").items()}
+    assert places["Catch / fast / seed 0"] == "one/fast_seed0" and places["Catch / slow / seed 0"] == "slow"
+    assert "one, slow" in page.text and str(tmp_path) not in page.text
+    monkeypatch.chdir(tmp_path / "two/runs/slow")
+    page = Page(build("..", media=False))
+    assert page.table("Every run")["Catch / slow / seed 0"][-1] == "slow"
+    assert "Directory runs" in page.text
+
+
+def test_arms_are_in_the_order_of_their_numbers(tmp_path):
+    from experiments.collect import load_runs
+    from experiments.reporting import numbers
+
+    for arm in ("weight10", "weight9", "weight100", "joint_50"):
+        write_run(tmp_path / arm / "seed0", [0.0])
+    assert numbers.arms_of(load_runs(tmp_path)) == ["joint_50", "weight9", "weight10", "weight100"]

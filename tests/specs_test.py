@@ -168,3 +168,14 @@ def test_other_numbers_have_single_precision(sign):
     assert info.parse(repr(limit)) == limit
     with pytest.raises(ValueError, match="3.402823466e.38$"):
         info.parse(repr(float(np.nextafter(limit, sign * np.inf))))
+
+
+def test_names_that_may_have_been_meant():
+    names = ["gamma", "lr_rl", "lr_encoder", "slr", "Lr_end", "x_lr"]
+    # The first two are spelt nearly so; the others have it as a word.
+    assert specs.near("lr", names) == ["slr", "x_lr", "Lr_end", "lr_encoder", "lr_rl"]
+    assert specs.near("lr", names, most=2) == ["slr", "x_lr"]
+    assert specs.near("GAMA", names) == ["gamma"] and specs.near("q", names) == []
+    # A set has an order of its own in each process.
+    assert specs.choices_text("q", {"b", "a", "c"}) == "valid: a, b, c"
+    assert specs.choices_text("q", ["b", "a"]) == "valid: b, a"

@@ -351,8 +351,10 @@ def test_a_dry_run_writes_nothing_and_counts(stubs):
         "3 of 4 runs to run, 1,500 env steps, 0:00:08 with 2 at once; speeds: runs of this sweep"
     )
     assert sorted(stubs.root.rglob("*")) == before
-    (line,) = sweep.dry_run(stubs.root / "new", [run(A)], workers=2, resolve=resolve)[2:]
+    line, why = sweep.dry_run(stubs.root / "new", [run(A)], workers=2, resolve=resolve)[2:]
     assert line == "1 of 1 runs to run, 500 env steps, unknown time with 2 at once; speeds: unknown"
+    assert why.startswith("unknown: no run of this game's kind, encoder and mode has been timed")
+    assert "--status" in why
 
 
 def test_bad_input_is_one_line_and_status_2(tmp_path):

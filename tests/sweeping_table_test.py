@@ -12,7 +12,10 @@ from experiments.sweeping.launching import View
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
 from experiments.sweeping.speed import Progress, Speeds, seconds_left
+from srl_jax import ending
 from srl_jax.config import Config
+from srl_jax.ending import Ending
+from tests.helpers import NOT_FINITE
 
 CONFIG = Config(game="Catch", frame_size=42, steps=1000, learn_start=10)
 
@@ -126,3 +129,15 @@ def test_the_screen_redraws_on_a_terminal_and_tells_changes_elsewhere(tmp_path, 
         assert "\x1b" not in text and text.count("sweep: a: started\n") == 1
     assert text.count("2 waiting") == 1 and text.count("0 of 2 runs done, 2 failed") == 1
     assert text.endswith("\na: failed: no\nb: failed: no\n")
+
+
+def test_a_run_that_failed_without_a_sweep_is_shown_as_failed(tmp_path):
+    found = entries(a="", b="", c="a")
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        found[name].config.save(tmp_path / name)
+    ending.write(tmp_path / "a", NOT_FINITE)
+    ending.write(tmp_path / "b", Ending("stopped", 100))
+    seen = table.view_of_files(tmp_path, found)
+    assert seen.failed == {"a": NOT_FINITE.reason} and seen.blocked == {"c": "a failed"}
+    assert seen.waiting == {"b": ""}

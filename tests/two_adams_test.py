@@ -1,7 +1,7 @@
 """srl_jax/update.py: how two losses step one encoder, against PyTorch's own Adams.
 
-`two_adams.json` was made by `python tests/two_adams_test.py`, which needs PyTorch (2.13 then): ten updates of a
-small network, as the thesis' authors write them, in each of the three forms.
+`two_adams.json` was made by `python tests/two_adams_test.py`, which needs PyTorch (2.13 then): ten updates
+of a small network, as the thesis' authors write them, in each of the three forms.
 """
 
 import json

@@ -9,6 +9,7 @@ from experiments import collect
 from experiments.collect import RunData
 from srl_jax import specs
 from srl_jax.config import INFOS, Config
+from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
@@ -146,11 +147,19 @@ def value_text(value: Any) -> str:
 
 
 def protocol_text(config: Config) -> str:
-    """How a policy was evaluated, in a line."""
+    """How a policy was evaluated, in a line; what only Atari games have is said of these alone."""
     sticky = f"sticky actions {config.sticky_actions:g}" if config.sticky_actions else "no sticky actions"
-    return (
-        f"{config.eval_games} full games an evaluation, every {config.eval_every:,} env steps; epsilon "
-        f"{config.eps_eval:g}; {sticky}; up to {config.noop_max} no-ops at the start; at most "
-        f"{config.eval_max_steps:,} env steps a game; in training, a lost life "
-        f"{'ends the return' if config.life_loss else 'ends nothing'}"
-    )
+    noops = f"fewer than {config.noop_max} no-ops at the start" if config.noop_max > 1 else "no no-ops"
+    atari = config.game in ATARI_57
+    parts = [
+        f"{config.eval_games} full games an evaluation, every {config.eval_every:,} env steps",
+        f"epsilon {config.eps_eval:g}",
+        *([sticky, noops] if atari else []),
+        f"at most {config.eval_max_steps:,} env steps a game{', of 4 frames each' if atari else ''}",
+        *(
+            [f"in training, a lost life ends {'the return' if config.life_loss else 'nothing'}"]
+            if atari
+            else []
+        ),
+    ]
+    return "; ".join(parts)

@@ -1,5 +1,6 @@
 """What all sections of a report start from, and how they show intervals."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
@@ -21,7 +22,7 @@ class Report(NamedTuple):
     """What all sections start from.
 
     Attributes:
-        root: where the runs are.
+        roots: where the runs are.
         runs: all of them.
         arms: in their order.
         baseline: what others are compared with, or None.
@@ -33,7 +34,7 @@ class Report(NamedTuple):
         media: whether pictures of the runs are shown.
     """
 
-    root: Path
+    roots: list[Path]
     runs: list[RunData]
     arms: list[str]
     baseline: str | None
@@ -57,6 +58,26 @@ class Report(NamedTuple):
     def styles(self) -> dict[str, Style]:
         """How each arm is drawn, in all pictures of the page."""
         return styles(self.arms)
+
+    def place(self, run: RunData) -> Path:
+        """Where a run lies, below the directory that was named; with its name where there are several."""
+        root = next(root for root in self.roots if run.path.is_relative_to(root))
+        below = run.path.relative_to(root)
+        return below if len(self.roots) == 1 else name_of(root) / below
+
+    def left_out(self, game: str) -> list[str]:
+        """A line for each arm of a game of which seeds cannot be compared."""
+        whys: dict[str, dict[int, str]] = {arm: {} for arm in self.arms}
+        for run, why in collect.left_out(self.of(game)):
+            whys[run.arm][run.seed] = why
+        return [
+            collect.left_out_text(arm, seeds, len(self.of(game, arm))) for arm, seeds in whys.items() if seeds
+        ]
+
+
+def name_of(root: Path) -> Path:
+    """The name of a directory, also of "." and "..": what lies above is nobody's business."""
+    return Path(os.path.basename(os.path.abspath(root)))
 
 
 def run_name(run: RunData) -> str:

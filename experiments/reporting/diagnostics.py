@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import collect
+from experiments import collect, plots
 from experiments.collect import RunData
 from experiments.colours import Style
 from experiments.reporting import pictures
@@ -113,7 +113,8 @@ def panels(runs: Sequence[RunData], looks: Mapping[str, Style]) -> list[Panel]:
                     lines.append((style, curve))
             if lines:
                 title = form.title.format(_middle(key, form.key))
-                found.append(Panel(title, form.meaning, pictures.curves(title, lines), form.first))
+                picture = pictures.curves(title, lines, across=plots.steps_label(runs[0].game))
+                found.append(Panel(title, form.meaning, picture, form.first))
     return found
 
 

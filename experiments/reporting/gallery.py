@@ -1,14 +1,16 @@
 """The pictures of a report, in their sections."""
 
 import functools
+import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments import collect, diagnostic_plots
+from experiments import collect, diagnostic_plots, plots
 from experiments.collect import RunData
+from experiments.directories import natural
 from experiments.reporting import diagnostics, numbers, pictures
 from experiments.reporting.contents import Content, Report, run_name
 from experiments.reporting.markup import Markup, breakable, details, figure, listed, plural, tag
@@ -28,7 +30,8 @@ OWN = ("learning_curve", "losses", "diagnostics", "drift")
 def figures(report: Report) -> Content:
     """What experiments.figures has drawn, with the title and the question beside it."""
     found = []
-    for path in sorted((report.root / "figures").glob("*.png")):
+    paths = [sorted((x / "figures").glob("*.png"), key=lambda p: natural(p.name)) for x in report.roots]
+    for path in itertools.chain(*paths):
         picture = pictures.taken(path, pictures.LARGEST)
         about = _beside(path.with_suffix(".json"))
         title, question = (str(about.get(key) or "") for key in ("title", "question"))
@@ -67,18 +70,18 @@ def learning_curves(report: Report) -> Content:
         limits = pictures.heights(curves.values(), policies.values())  # the same in all pictures of a game
         for group in groups(arms, report.baseline):
             lines = [(report.styles[arm], curves[arm]) for arm in group]
-            picture = pictures.curves(
-                game, lines, size=(5.4, 3.5), label="mean return", policies=policies, limits=limits
-            )
+            how = {"label": "mean return", "across": plots.steps_label(game), "size": (5.4, 3.5)}
+            picture = pictures.curves(game, lines, policies=policies, limits=limits, **how)
             caption = _legend(report, {arm: len(comparison.returns[arm]) for arm in group})
             drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))
     if not drawn:
         return None
+    left_out = [f" {game}, {line}." for game in report.games for line in report.left_out(game)]
     note = (
         "Mean evaluation return, and its 95 % t interval over seeds at each env step that all runs of a game "
         "have. Lines across: policies that learn nothing."
     )
-    return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
+    return [tag("p", note, *left_out, class_="note"), tag("div", drawn, class_="grid wide")]
 
 
 def profiles(report: Report) -> Content:
@@ -171,12 +174,17 @@ def _by_game(report: Report, cells: Callable[[RunData], list[Markup]], kind: str
 
 
 def _first_runs(report: Report, game: str) -> list[RunData]:
-    """The first seed of each arm."""
-    return [runs[0] for arm in report.arms if (runs := report.of(game, arm))]
+    """The first seed of each arm that has not failed."""
+    return [runs[0] for arm in report.arms if (runs := _sound(report, game, arm))]
+
+
+def _sound(report: Report, game: str, arm: str | None = None) -> list[RunData]:
+    """The runs of a game, or of one arm on it, that have not failed: others would cut all curves."""
+    return [run for run in report.of(game, arm) if not run.failed]
 
 
 def _panels(run: RunData) -> list[Path]:
-    found = sorted((run.path / "figures").glob("*.png"))
+    found = sorted((run.path / "figures").glob("*.png"), key=lambda path: natural(path.name))
     return [path for path in found if path.stem not in OWN]
 
 
@@ -199,14 +207,14 @@ def diagnostic_pictures(report: Report) -> Content:
         )
     parts: list = []
     for game in report.games:
-        found = diagnostics.panels(report.of(game), report.styles)
+        found = diagnostics.panels(_sound(report, game), report.styles)
         if not found:
             continue
         first, others = (
             [_panel(game, panel) for panel in found if panel.first == at_once] for at_once in (True, False)
         )
-        having = {run.arm for run in report.of(game) if diagnostics.keys_of([run])}
-        seeds = {arm: len(report.of(game, arm)) for arm in report.arms if arm in having}
+        having = {run.arm for run in _sound(report, game) if diagnostics.keys_of([run])}
+        seeds = {arm: len(_sound(report, game, arm)) for arm in report.arms if arm in having}
         parts += [tag("h3", game), _legend(report, seeds), tag("div", first, class_="grid small")]
         if others:
             more = f"{plural(len(others), 'more picture')} of {game}"
@@ -214,7 +222,10 @@ def diagnostic_pictures(report: Report) -> Content:
         parts.append(_drift(report, game))
     if without:
         parts.append(tag("p", f"Without diagnostics: {listed(map(run_name, without))}.", class_="note"))
-    note = "Measured at every evaluation; means over seeds and their 95 % t intervals at each point."
+    note = (
+        "Measured at every evaluation; means over seeds that have not failed and their 95 % t intervals at "
+        "each point."
+    )
     return [tag("p", note, class_="note"), *parts]
 
 

@@ -3,6 +3,7 @@
 Imports no jax.
 """
 
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,13 +11,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from experiments import collect
-from experiments.collect import RunData
+from experiments.collect import RunData, has_policy
+from experiments.directories import natural
 from experiments.presets import PRESETS
 from experiments.reporting import configs
 from srl_jax import statistics
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.modes import MODES
 from srl_jax.specs import LIMITS
 
 NEVER = 1e18
@@ -86,13 +87,16 @@ def arms_of(runs: Sequence[RunData]) -> list[str]:
     """All arms: those of the presets in their order, then the others; those without a policy last."""
     known = {name.partition("/")[2] or name: i for i, name in reversed(list(enumerate(PRESETS)))}
     playing = {run.arm for run in runs if has_policy(run)}
-    return sorted({run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(PRESETS)), a))
+    return sorted(
+        {run.arm for run in runs}, key=lambda a: (a not in playing, known.get(a, len(PRESETS)), natural(a))
+    )
 
 
 def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None = None) -> str | None:
     """The arm that others are compared with, or None where no arm has a policy.
 
-    The one that was asked for, else the first that is RL alone, else the first with a policy.
+    The one that was asked for, else the first that is RL alone, else the first with a policy: of those that
+    can be compared, as long as there are some.
 
     Raises:
         ConfigError: the one that was asked for is not there.
@@ -104,13 +108,9 @@ def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None 
                 f"--baseline={given}: not an arm with a policy; valid: {', '.join(sorted(playing))}"
             )
         return given
-    plain = {run.arm for run in runs if run.config.mode == "rl_only"}
-    return next((arm for arm in arms if arm in plain), next((arm for arm in arms if arm in playing), None))
-
-
-def has_policy(run: RunData) -> bool:
-    """Whether its mode trains a policy, which is then evaluated."""
-    return MODES[run.config.mode].rl
+    playing = {run.arm for run in collect.comparable(runs)} or playing
+    plain = {run.arm for run in runs if run.config.mode == "rl_only"} & playing
+    return next((arm for arm in arms if arm in (plain or playing)), None)
 
 
 def config_of(runs: Sequence[RunData]) -> Config:
@@ -124,8 +124,13 @@ def reached_step(run: RunData) -> int:
 
 
 def finished(run: RunData) -> bool:
-    """Whether its last rows are there: those of its last env steps, or of the return that ends a run."""
+    """Whether its last rows are there: those of its last env steps, or of the return that ends a run.
+
+    Not where it ended with an error all the same.
+    """
     config = run.config
+    if run.failed:
+        return False
     steps, returns = collect.steps_and_returns(run)
     if config.stop_at_return is not None and (returns >= config.stop_at_return).any():
         return True
@@ -296,8 +301,9 @@ def _source(run: RunData, runs: Sequence[RunData]) -> str:
         return ""
     parts = Path(path).parts
     for other in runs:
-        tail = other.path.absolute().parts[-3:]
-        if any(parts[i : i + 3] == tail for i in range(len(parts))):
+        # As it is named here, and as it lies on disk: its directory may be a link.
+        tails = {p.parts[-3:] for p in (other.path.absolute(), Path(os.path.realpath(other.path)))}
+        if any(parts[i : i + 3] in tails for i in range(len(parts))):
             return other.arm
     return configs.source_name(path)
 

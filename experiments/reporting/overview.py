@@ -7,7 +7,15 @@ import numpy as np
 from experiments import collect
 from experiments.reporting import configs, numbers, pictures
 from experiments.reporting.configs import About
-from experiments.reporting.contents import Content, Report, difference_text, limits, run_name, side
+from experiments.reporting.contents import (
+    Content,
+    Report,
+    difference_text,
+    limits,
+    name_of,
+    run_name,
+    side,
+)
 from experiments.reporting.markup import Markup, details, figure, listed, number, plural, table, tag
 from experiments.reporting.numbers import Row
 from experiments.reporting.tables import interval_of, summary_of
@@ -38,10 +46,13 @@ def what_was_run(report: Report) -> Content:
         ("Begun (UTC)", " to ".join(dict.fromkeys([began[0], began[-1]])) if began else "not recorded"),
         ("Revisions", [[", " if i else "", tag("code", name)] for i, name in enumerate(revisions)]),
         ("Machine", _machine(abouts)),
-        ("Directory", tag("code", report.root.absolute().name)),
+        ("Directory", [[", " if i else "", tag("code", name_of(x))] for i, x in enumerate(report.roots)]),
     ]
     parts: list = [tag("dl", [[tag("dt", name), tag("dd", value)] for name, value in facts])]
-    if left := [run for run, done in zip(report.runs, ended, strict=True) if not done]:
+    if failed := [run for run in report.runs if run.failed]:
+        items = [tag("li", f"{run_name(run)}: {run.ended.reason}") for run in failed]
+        parts.append(tag("div", tag("strong", "Failed, not compared:"), tag("ul", items), class_="warn"))
+    if left := [r for r, done in zip(report.runs, ended, strict=True) if not (done or r.failed)]:
         items = [
             tag("li", f"{run_name(run)}: {numbers.reached_step(run):,} of {run.config.steps:,} env steps")
             for run in left
@@ -85,8 +96,9 @@ def _all_runs(report: Report, abouts: Sequence[About]) -> Markup:
         steps, returns = collect.steps_and_returns(run)
         last = f"{number(float(returns[-1]))} at {steps[-1]:,}" if len(steps) else "–"
         cells = [run_name(run), f"{numbers.reached_step(run):,} of {run.config.steps:,}"]
-        cells += ["yes" if numbers.finished(run) else "no", len(steps), last, _short(about)]
-        cells += [about.started or "–", tag("code", run.path.relative_to(report.root))]
+        how = "failed" if run.failed else "yes" if numbers.finished(run) else "no"
+        cells += [how, len(steps), last, _short(about)]
+        cells += [about.started or "–", tag("code", report.place(run))]
         rows.append(cells)
     head = ("run", "env steps", "finished", "evaluations", "last return", "revision", "begun", "directory")
     return table(head, rows, "Every run")

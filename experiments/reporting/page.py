@@ -28,18 +28,17 @@ SECTIONS = (
 
 
 def build(
-    root: str | Path,
-    *,
+    *roots: str | Path,
     baseline: str | None = None,
     reach: Mapping[str, float] | None = None,
     force: bool = False,
     finished_only: bool = False,
     media: bool = True,
 ) -> str:
-    """The page of all runs in or below a directory, as HTML.
+    """The page of all runs in or below directories, as HTML.
 
     Args:
-        root: the directory; its figures/*.png are shown, too.
+        *roots: the directories; their figures/*.png are shown, too.
         baseline: the arm that the others are compared with, or None for what `numbers.baseline_of` says.
         reach: game -> score, where the env steps to reach it are asked for.
         force: compare what differs in its protocol.
@@ -51,7 +50,7 @@ def build(
             forced, or there is no such baseline or game.
     """
     report = gather(
-        Path(root),
+        [Path(root) for root in roots],
         baseline=baseline,
         reach=reach or {},
         force=force,
@@ -63,7 +62,7 @@ def build(
 
 
 def gather(
-    root: Path,
+    roots: list[Path],
     *,
     baseline: str | None,
     reach: Mapping[str, float],
@@ -72,7 +71,7 @@ def gather(
     media: bool,
 ) -> Report:
     """Reads and compares the runs; see `build`."""
-    runs = collect.load_runs(root)
+    runs = collect.load_runs(*roots)
     forced = collect.check_protocols(runs, force=force)
     try:
         collect.check_arms(runs)
@@ -90,7 +89,7 @@ def gather(
     comparisons = numbers.compare(compared, arms)
     targets = numbers.targets(comparisons, against, reach)
     rows = numbers.rows(comparisons, arms, against, targets)
-    return Report(root, runs, arms, against, forced, finished_only, comparisons, rows, targets, media)
+    return Report(roots, runs, arms, against, forced, finished_only, comparisons, rows, targets, media)
 
 
 def _page(report: Report, sections: list[tuple[str, str, Content]]) -> str:

@@ -201,7 +201,7 @@ def curves(
             width, marker = 1.5 if small else 1.8, "o" if len(curve.at) == 1 else ""
             axes.plot(curve.at, curve.point, line, color=colour, linewidth=width, marker=marker, markersize=3)
         axes.set_title(title, fontsize=9 if small else 11, parse_math=False)
-        (plots.count_axis if across == plots.STEPS_LABEL else plots.plain)(axes)
+        (plots.count_axis if across.startswith(plots.STEPS_LABEL) else plots.plain)(axes)
         axes.tick_params(labelsize=7 if small else 9)
         axes.set_xlabel(across, fontsize=7.5 if small else 9)
         axes.set_ylabel(label, fontsize=9)

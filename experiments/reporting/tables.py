@@ -29,7 +29,8 @@ AGGREGATES = {
 def statistics_of(report: Report) -> Content:
     """Per game, over games, and what others have published."""
     if not report.rows:
-        return tag("p", "No run has a policy that was evaluated, so there is nothing to compare.")
+        nothing = tag("p", "No run has a policy that was evaluated, so there is nothing to compare.")
+        return [nothing, *(_left_out(report, game) for game in report.games)]
     parts: list = [
         tag(
             "p",
@@ -40,17 +41,28 @@ def statistics_of(report: Report) -> Content:
             "; ▲ and ▼ mark those that Welch's test at 5 % finds.",
         )
     ]
-    for game, comparison in report.comparisons.items():
-        parts.append(tag("h3", game))
-        if comparison is None:
-            parts.append(tag("p", "There is no env step that all runs of this game have."))
-        else:
+    for game in report.games:
+        comparison, left_out = report.comparisons.get(game), _left_out(report, game)
+        if game in report.comparisons or left_out:
+            parts.append(tag("h3", game))
+        if comparison is not None:
             parts += _of_game(report, game, comparison)
+        elif game in report.comparisons:
+            parts.append(tag("p", "There is no env step that all runs of this game have."))
+        parts.append(left_out)
     parts += _over_games(report)
     for game, comparison in report.comparisons.items():
         if comparison is not None:
             parts += _published(report, game, comparison)
     return parts
+
+
+def _left_out(report: Report, game: str) -> Content:
+    """Which seeds of a game are not compared, and why; None where all are."""
+    if not (lines := report.left_out(game)):
+        return None
+    items = tag("ul", [tag("li", line) for line in lines])
+    return tag("div", tag("strong", "Not compared:"), items, class_="warn")
 
 
 def _of_game(report: Report, game: str, comparison: Comparison) -> list:

@@ -9,7 +9,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from experiments import runtime
+from experiments import control_groups, runtime
 from srl_jax.config import Config
 
 RUN_BYTES = 600 * 2**20
@@ -24,17 +24,17 @@ def run_bytes(config: Config) -> int:
     return RUN_BYTES + config.buffer_size * config.frame_size**2
 
 
-def free_bytes() -> int | None:
-    """Memory that new processes can have, also under a control group's limit; None where it is not known."""
-    found = []
-    with contextlib.suppress(OSError, ValueError, IndexError):
-        lines = Path("/proc/meminfo").read_text().splitlines()
+def free_bytes(root: Path = control_groups.ROOT) -> int | None:
+    """Memory that new processes can have, also under a control group's limit; None where it is not known.
+
+    Args:
+        root: of the file system; another one for tests.
+    """
+    found = [control_groups.free_bytes(root)]
+    with contextlib.suppress(OSError, ValueError, IndexError, StopIteration):
+        lines = (root / "proc/meminfo").read_text().splitlines()
         found.append(next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")))
-    group = Path("/sys/fs/cgroup")
-    with contextlib.suppress(OSError, ValueError):  # ValueError: "max"
-        limit = int((group / "memory.max").read_text())
-        found.append(limit - int((group / "memory.current").read_text()))
-    return max(min(found), 0) if found else None
+    return min((size for size in found if size is not None), default=None)
 
 
 def has_gpu() -> bool:

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from experiments.directories import runs_below
 from experiments.sweeping.manifest import Entry
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
@@ -127,9 +128,9 @@ class Speeds:
 
 
 def _published(results: Path) -> Iterable[tuple[Path, Config]]:
-    for file in sorted(results.rglob("config.json")):
+    for path in runs_below(results):
         try:
-            yield file.parent, Config.load(file.parent)
+            yield path, Config.load(path)
         except ConfigError:
             continue
 

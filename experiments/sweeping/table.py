@@ -12,7 +12,7 @@ from experiments.sweeping import states
 from experiments.sweeping.launching import View
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.speed import Progress, Speeds, progress, seconds_left
-from srl_jax import checkpoint, rundir
+from srl_jax import checkpoint, ending, rundir
 from srl_jax.errors import ConfigError
 from srl_jax.progress import hms
 
@@ -245,6 +245,8 @@ def view_of_files(root: Path, entries: Mapping[str, Entry]) -> View:
             view.running.append(name)  # in its first seconds a process does not hold the directory yet
         elif record is not None and record.ended is not None and record.status and record.reason:
             view.failed[name] = record.reason
+        elif record is None and (reason := _failed(root / name)):  # it was not run by a sweep
+            view.failed[name] = reason
         elif bad:
             view.blocked[name] = f"{bad} failed" if bad in view.failed else view.blocked[bad]
         elif record is not None and record.ended is None:
@@ -252,3 +254,11 @@ def view_of_files(root: Path, entries: Mapping[str, Entry]) -> View:
         else:
             view.waiting[name] = state.reason if state.kind == "broken" else ""
     return view
+
+
+def _failed(run: Path) -> str:
+    """Why a run ended with an error, as its directory says; "" where it does not."""
+    with contextlib.suppress(ConfigError):
+        if (ended := ending.read(run)) is not None and ended.failed:
+            return ended.reason
+    return ""

@@ -2,8 +2,8 @@
 
     python experiments/results/pong_choices/run_on_gpu.py OUT SECONDS ARM:SEED...
 
-What has not ended after so many seconds is stopped by SIGTERM and keeps its rows. On one H200 four runs at once
-make 7,800 env steps a second together; thirteen pairs of seeds (`--seeds=0,1`) made 1,250.
+What has not ended after so many seconds is stopped by SIGTERM and keeps its rows. On one H200 four runs at
+once make 7,800 env steps a second together; thirteen pairs of seeds (`--seeds=0,1`) made 1,250.
 `python -m experiments.figures` with `choices.json` makes the same runs on a CPU.
 """
 

@@ -1,0 +1,112 @@
+"""How a run ended, as its directory says it: ended.json. Imports no jax.
+
+Written by the process that ends, and removed where a run is gone on with. So a run without one is under way,
+or it was killed.
+"""
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from threading import BrokenBarrierError
+from typing import NamedTuple
+
+from srl_jax.errors import ConfigError, Diverged, SaveError
+from srl_jax.reading import SETTINGS, parse_json, read_bytes
+
+FILE = "ended.json"
+STATUSES = ("finished", "stopped", "diverged", "failed")
+"""What `Ending.status` may be: at its end, by somebody, by a loss that is not finite, by another error."""
+
+
+class Ending(NamedTuple):
+    """How a run ended.
+
+    Attributes:
+        status: one of `STATUSES`.
+        env_steps: when.
+        reason: why it did not end well, a line; empty where it did.
+    """
+
+    status: str
+    env_steps: int
+    reason: str = ""
+
+    @property
+    def failed(self) -> bool:
+        """Whether it ended with an error; "stopped" is none."""
+        return self.status in ("diverged", "failed")
+
+
+def of(error: BaseException, env_steps: int) -> Ending:
+    """The ending of a run that an exception has ended.
+
+    Args:
+        error: whatever it was.
+        env_steps: that the run had done.
+    """
+    if isinstance(
+        error, KeyboardInterrupt | BrokenBarrierError
+    ):  # the latter where another seed was the first
+        return Ending("stopped", env_steps)
+    line = " ".join(str(error).split())
+    if isinstance(error, Diverged):  # what follows is advice for whoever watches
+        return Ending("diverged", env_steps, line.partition(";")[0])
+    return Ending(
+        "failed", env_steps, line if isinstance(error, SaveError) else f"{type(error).__name__}: {line}"
+    )
+
+
+def write(run: Path, ending: Ending) -> None:
+    """Writes ended.json of a run directory at once, flushed to disk.
+
+    Raises:
+        SaveError: it could not be written.
+    """
+    partial = run / f"{FILE}.partial"
+    try:
+        with open(partial, "w", encoding="utf-8") as file:
+            file.write(json.dumps(ending._asdict()) + "\n")
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(partial, run / FILE)
+    except OSError as error:
+        raise SaveError(f"{run / FILE}: not written: {error.strerror}") from error
+
+
+def read(run: Path) -> Ending | None:
+    """How the run in a directory ended; None where it is under way, or was killed, or is of before.
+
+    Raises:
+        ConfigError: the file cannot be read, or says something else.
+    """
+    path = run / FILE
+    try:
+        values = parse_json(read_bytes(path, SETTINGS))
+        ending = Ending(**values)
+        if (
+            ending.status not in STATUSES
+            or type(ending.env_steps) is not int
+            or type(ending.reason) is not str
+        ):
+            raise ValueError("not an ending")
+    except FileNotFoundError:
+        return None
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except (ValueError, TypeError) as error:
+        raise ConfigError(f"{path}: not what training writes ({str(error)[:100]})") from None
+    return ending
+
+
+def clear(run: Path) -> None:
+    """Removes ended.json: the run is under way.
+
+    Raises:
+        SaveError: it cannot be removed.
+    """
+    try:
+        with contextlib.suppress(FileNotFoundError):
+            (run / FILE).unlink()
+    except OSError as error:
+        raise SaveError(f"{run / FILE}: not removed: {error.strerror}") from error
