@@ -71,7 +71,8 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     from srl_jax.evaluate import evaluate
 
     agent, params, manifest = loop.load_agent(FLAGS.run)
-    env = loop.make_env(config, min(FLAGS.games, config.num_envs), FLAGS.seed)
+    number = min(FLAGS.games, config.num_envs)
+    env = loop.make_env(config, number, FLAGS.seed, max_steps=config.eval_max_steps)
     if manifest.num_actions != env.single_action_space.n:
         raise ConfigError(
             f"{manifest.path}: its policy has {manifest.num_actions} actions, {config.game} has "

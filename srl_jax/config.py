@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from srl_jax import modes, specs
-from srl_jax.envs import GAMES
+from srl_jax.envs import FRAME_SKIP, GAMES
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import Info
@@ -119,7 +119,10 @@ class Config:
 
     eval_every: int = _steps(100_000, "how often the policy is evaluated (one epoch)")
     eval_games: int = _value(int, 10, "full games of one evaluation", "games", minimum=1)
-    eval_max_steps: int = _steps(27_000, "longest evaluation game (27,000 are 108,000 frames)")
+    eval_max_steps: int = _value(
+        int, 27_000, "longest evaluation game (27,000 are 108,000 frames)", "env steps",
+        minimum=1, maximum=specs.LIMITS[int] // FRAME_SKIP,
+    )  # fmt: skip
     stop_at_return: float | None = _value(
         float, None, "mean evaluation return that ends the run early, or off", "unclipped score",
         optional=True,
