@@ -9,7 +9,7 @@ from pathlib import Path
 from experiments import flags as config_flags
 from srl_jax import checkpoint, rundir
 from srl_jax.checkpoint import Manifest
-from srl_jax.config import PARTIAL, Config, difference, told_to_xla
+from srl_jax.config import PARTIAL, SOURCES, Config, another_run, changes, record_changes
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import read_metrics
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
@@ -150,7 +150,8 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
     if blank(path):
         return None
     rundir.check_free(path)
-    if differing := difference(Config.load(path), config):
+    there = Config.load(path)
+    if differing := another_run(there, config):
         raise ConfigError(f"--out={path}: the run there has another configuration: {differing}")
     manifest = checkpoint.newest_good(path, say, at_most)
     if manifest is None:
@@ -161,13 +162,37 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
             )
         say(f"{path}: no checkpoint there yet; the run begins again")
         return None
-    if differing := difference(manifest.config, config):
+    if differing := another_run(manifest.config, config):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
-    about = parse_json(read_bytes(path / "config.json", SETTINGS))
-    then, now = about.get("environment"), told_to_xla()
-    if then != now:
-        say(f"{path}: XLA was told {then} and is told {now} now: roundings differ")
+    if checkpoint.NUMBERS not in manifest.files:
+        return manifest
+    for flag in SOURCES:
+        then, now = getattr(there, flag), getattr(config, flag)
+        if then != now:
+            how = "the run goes on with the latter" if flag == "policy_from" else "neither is read any more"
+            say(f"{path}: --{flag} was {then} and is {now}: {how}")
+    if changed := changes(path):
+        what = ", ".join(
+            f"{name} was {then!r:.200} and is {now!r:.200}" for name, (then, now) in changed.items()
+        )
+        say(f"{path}: {what}: results may differ from those of a run that did not end")
     return manifest
+
+
+@contextlib.contextmanager
+def going_on(path: Path, manifest: Manifest) -> Iterator[None]:
+    """Holds the directory of a run that goes on; its config.json gets what has changed since it began.
+
+    Raises:
+        ConfigError: another process writes there.
+        SaveError: config.json could not be written.
+    """
+    with rundir.held(path):
+        try:
+            record_changes(path, manifest.env_steps)
+        except OSError as error:
+            raise SaveError(f"--out={path}: {error.strerror}") from None
+        yield
 
 
 def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:

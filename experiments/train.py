@@ -19,10 +19,10 @@ from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
-from experiments.directories import all_to_resume, check_out, run_directory
-from srl_jax.config import INFOS, Config, resolve
+from experiments.directories import all_to_resume, check_out, going_on, run_directory
+from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.rundir import check_free, held
+from srl_jax.rundir import check_free
 from srl_jax.specs import build, parse
 
 FLAGS = flags.FLAGS
@@ -96,7 +96,7 @@ def check_paths(config: Config) -> None:
     Raises:
         ConfigError: one does not.
     """
-    for flag in ("encoder_from", "policy_from"):
+    for flag in SOURCES:
         path = getattr(config, flag)
         if path and not os.path.exists(path):
             raise ConfigError(f"--{flag}={path}: no such path; give a run directory or a checkpoint")
@@ -170,23 +170,28 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     for directory in [path / f"seed{seed}" for seed in seeds] or [path]:
         check_free(directory)
     check_extras(config)
-    check_paths(config)
+    if not resume:
+        check_paths(config)
     if prepare is not None:
         prepare(values["tune_runtime"].value, config.encoder)
     config = resolved(config)
 
     from srl_jax import checkpoint, loop
 
-    checkpoint.check_sources(config)
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs) if resume else [None] * len(runs)
     if all(m is not None and checkpoint.NUMBERS not in m.files for m in manifests):
         print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
         return 0
+    # A checkpoint has the encoder; the policy that others are pretrained on is read again.
+    needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
+    check_paths(needed)
+    checkpoint.check_sources(needed)
     with contextlib.ExitStack() as stack:
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
-            stack.enter_context(held(directory) if manifest else run_directory(directory, its_config))
+            holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)
+            stack.enter_context(holding)
         caught = stack.enter_context(stopping())
         if seeds:
             from srl_jax import lockstep

@@ -153,7 +153,7 @@ class Run:
         self.agent = agent or make_agent(config, self.num_actions)
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.key = jax.random.key(config.seed)
-        self.state = self.agent.init(self.key, self.initial_encoder())
+        self.state = self.agent.init(self.key, self.initial_encoder() if resume is None else None)
         frame = self.env.single_observation_space.shape
         try:
             self.replay = Replay(

@@ -335,6 +335,43 @@ def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     assert len(loop.calls) == 1
 
 
+def test_a_run_goes_on_without_the_one_that_it_started_from(capsys, loop, tmp_path):
+    pre, out = tmp_path / "pre", tmp_path / "run"
+    objective = "--objective=reconstruction"
+    _train(*CATCH, "--mode=pretrain", objective, f"--out={pre}")
+    _checkpoint(pre, 500, ended=True)
+    frozen = [*CATCH, "--mode=frozen", f"--out={out}", "--resume=auto"]
+    _train(*frozen, f"--encoder_from={pre}")
+    made = _checkpoint(out, 200)
+    pre.rename(tmp_path / "moved")
+    capsys.readouterr()
+    for source in (pre, tmp_path / "moved", os.path.relpath(tmp_path / "moved")):
+        assert _train(*frozen, f"--encoder_from={source}") == 0
+        assert loop.resumed[-1] == made
+        said = capsys.readouterr().err
+        assert ("neither is read any more" in said) == (source != pre) and said.count("\n") <= 1
+    # What has to begin needs it.
+    line = _refused(
+        capsys, *CATCH[1:], "--mode=frozen", f"--encoder_from={pre}", "--resume=auto", f"--out={tmp_path}/new"
+    )
+    assert f"--encoder_from={pre}: no such path" in line and not (tmp_path / "new").exists()
+
+
+def test_pretraining_goes_on_with_the_policy_that_it_needs(capsys, loop, tmp_path):
+    policy, out = tmp_path / "policy", tmp_path / "run"
+    _train(*CATCH, f"--out={policy}")
+    _checkpoint(policy, 500, ended=True)
+    pretrain = [*CATCH, "--mode=pretrain", "--objective=reconstruction", f"--out={out}", "--resume=auto"]
+    _train(*pretrain, f"--policy_from={policy}")
+    made = _checkpoint(out, 200)
+    policy.rename(tmp_path / "moved")
+    capsys.readouterr()
+    line = _refused(capsys, *pretrain[1:], f"--policy_from={policy}")
+    assert line == (f"error: --policy_from={policy}: no such path; give a run directory or a checkpoint\n")
+    assert _train(*pretrain, f"--policy_from={tmp_path}/moved") == 0 and loop.resumed[-1] == made
+    assert "the run goes on with the latter" in capsys.readouterr().err
+
+
 def test_two_processes_do_not_write_one_run(capsys, loop, tmp_path):
     out = tmp_path / "run"
     _train(*CATCH, f"--out={out}")
