@@ -2,12 +2,11 @@
 
 import contextlib
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from experiments import flags as config_flags
-from srl_jax import checkpoint, rundir
+from srl_jax import checkpoint, display, rundir
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import PARTIAL, SOURCES, Config, another_run, changes, record_changes
 from srl_jax.errors import ConfigError, SaveError
@@ -16,8 +15,8 @@ from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
 
 def say(line: str) -> None:
-    """A line for whoever watches, on stderr."""
-    print(f"resume: {line}", file=sys.stderr)
+    """A line about going on, for whoever watches."""
+    display.say(f"resume: {line}")
 
 
 def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:

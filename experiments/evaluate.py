@@ -12,6 +12,7 @@ from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
+from srl_jax import display
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
 
@@ -95,11 +96,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         "returns": played.returns,
         "lengths": played.lengths,
     }
-    print(json.dumps(result))
     if FLAGS.gif:
         from experiments import plots
 
         plots.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
+    display.result(json.dumps(result))
 
 
 if __name__ == "__main__":

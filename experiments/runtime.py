@@ -20,6 +20,8 @@ import tempfile
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 
+from srl_jax import display
+
 GUARD = "SRL_JAX_RUNTIME"
 """Set in the process that `prepare` started; such a process is not started again."""
 
@@ -229,7 +231,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _say(text: str) -> None:
-    print(f"runtime: {text}", file=sys.stderr, flush=True)
+    display.say(f"runtime: {text}")
 
 
 def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ) -> None:
@@ -259,7 +261,8 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
     hint = "(--tune_runtime=off leaves the environment alone)"
     if _AT_START.keys() & new.keys() and GUARD not in env and sys.executable:
         _say(f"restarting with {_shown(new)} {hint}")
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         try:
             os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**env, **new, GUARD: "tuned"})
         except OSError as error:

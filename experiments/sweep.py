@@ -21,7 +21,7 @@ from experiments.sweeping import launching, local, machine, manifest, plan, reso
 from experiments.sweeping.launching import Launcher, Outcome
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
-from srl_jax import rundir
+from srl_jax import display, rundir
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import hms
@@ -282,11 +282,11 @@ def main(argv: list[str]) -> int:
         if not entries:
             raise ConfigError(f"--out={FLAGS.out}: no sweep there (no {manifest.FILE})")
         workers = options["workers"] or machine.most_workers()
-        print("\n".join(table.status(root, entries, workers)))
+        display.result("\n".join(table.status(root, entries, workers)))
         return 0
     runs = chosen_runs(FLAGS, root)
     if FLAGS.dry_run:
-        print("\n".join(dry_run(root, runs, **options)))
+        display.result("\n".join(dry_run(root, runs, **options)))
         return 0
     try:
         outcome = run_sweep(root, runs, **options)

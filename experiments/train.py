@@ -20,6 +20,7 @@ from absl import flags
 from experiments import flags as config_flags
 from experiments import runtime
 from experiments.directories import all_to_resume, check_out, going_on, run_directory
+from srl_jax import display
 from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.rundir import check_free
@@ -162,7 +163,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     """
     config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
     if values["print_config"].value:
-        print(resolved(config).to_json())
+        display.result(resolved(config).to_json())
         return 0
     seeds = check_seeds(values)
     resume = values["resume"].value == "auto"

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
 from experiments import collect, plots, report
+from experiments import flags as config_flags
 from experiments.collect import RunData
 from experiments.reporting import browser, configs, overview
 from srl_jax.config import Config
