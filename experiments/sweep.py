@@ -2,8 +2,9 @@
 
 A run for each preset, game and seed, and the runs whose encoder or policy these start from, each a process
 with a run directory of its own, --out/GAME/ARM/seedN. Given again, the command runs what is missing or
-broken; with --out alone it goes on with everything that was ever planned there. Ctrl-C and SIGTERM write a
-checkpoint of each run and end. `--status` says how far a sweep is, `--dry_run` what one would do.
+broken; with --out alone it goes on with everything that was ever planned there. Ctrl-C, SIGTERM, SIGHUP and
+SIGUSR1 write a checkpoint of each run and end. `--status` says how far a sweep is, `--dry_run` what one would
+do.
 
 Flags of experiments.train beside these are given to every run, but --steps: pretraining takes 0.3 of it, as
 in the thesis. Bad input ends with one line on stderr and exit status 2 before anything is written. Exit

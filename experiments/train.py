@@ -1,7 +1,8 @@
 """Trains one agent: `python -m experiments.train --preset=thesis/joint_256 --out=runs/pong`.
 
 Bad input ends with one line on stderr and exit status 2 before anything is written. What can be checked
-without jax is checked before jax is imported. Ctrl-C and SIGTERM write a checkpoint and end the run.
+without jax is checked before jax is imported. Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 write a checkpoint and end
+the run; a second Ctrl-C or SIGTERM ends it at once.
 """
 
 import contextlib
@@ -10,16 +11,15 @@ import functools
 import importlib.util
 import os
 import signal
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
 from experiments.directories import all_to_resume, check_out, going_on, run_directory
+from experiments.stopping import signals
 from srl_jax import display
 from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
@@ -103,25 +103,9 @@ def check_paths(config: Config) -> None:
             raise ConfigError(f"--{flag}={path}: no such path; give a run directory or a checkpoint")
 
 
-@contextlib.contextmanager
-def stopping() -> Iterator[list[int]]:
-    """A list that gets the signal when Ctrl-C or SIGTERM comes; a second one interrupts at once."""
-    caught: list[int] = []
-
-    def handle(number: int, frame: Any) -> None:
-        if caught:
-            raise KeyboardInterrupt
-        caught.append(number)
-
-    if threading.current_thread() is not threading.main_thread():  # which has the signals
-        yield caught
-        return
-    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield caught
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
+def interrupt() -> None:
+    """Ends a run in the middle of a step, without another checkpoint."""
+    raise KeyboardInterrupt
 
 
 def resolved(config: Config) -> Config:
@@ -193,7 +177,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
             holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)
             stack.enter_context(holding)
-        caught = stack.enter_context(stopping())
+        caught = stack.enter_context(signals(again=interrupt))
         if seeds:
             from srl_jax import lockstep
 

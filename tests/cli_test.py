@@ -414,20 +414,23 @@ def test_seeds_go_on_together(capsys, loop, tmp_path, monkeypatch):
     assert "seed1: no checkpoint there" in line
 
 
-def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkeypatch, number):
     def stopped(config, out, *, resume, stop):
         assert not stop()
         (out / "metrics.jsonl").touch()
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         assert stop()
-        with pytest.raises(KeyboardInterrupt):  # the second one does not wait
+        if number != signal.SIGTERM:
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):  # who asks twice does not wait
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(10)
         return types.SimpleNamespace(env_steps=40, updates=0, interrupted=True, pictures={}, recording=None)
 
     monkeypatch.setattr(loop, "train", stopped)
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    assert _train(*CATCH, f"--out={tmp_path}/run") == 128 + signal.SIGTERM
+    assert _train(*CATCH, f"--out={tmp_path}/run") == 128 + number
     assert capsys.readouterr().out.endswith(
         f"stopped after 40 env steps; --resume=auto goes on from there, in {tmp_path}/run\n"
     )
