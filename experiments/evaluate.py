@@ -66,6 +66,8 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     if prepare is not None:
         prepare(FLAGS.tune_runtime, config.encoder)
 
+    runtime.check_device()
+
     import jax
 
     from srl_jax import loop

@@ -159,6 +159,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         check_paths(config)
     if prepare is not None:
         prepare(values["tune_runtime"].value, config.encoder)
+    runtime.check_device()
     config = resolved(config)
 
     from srl_jax import checkpoint, loop

@@ -521,6 +521,44 @@ def test_the_entry_point_refuses_an_option_in_one_line(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unable to initialize\nmore")])
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(
+    capsys, loop, tmp_path, monkeypatch, error
+):
+    import jax
+
+    def devices():
+        raise error
+
+    monkeypatch.setattr(jax, "devices", devices)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    line = _refused(capsys, f"--out={tmp_path}/a")
+    why = " (Unable to initialize)" if str(error) else ""
+    assert line.startswith(f"error: JAX_PLATFORMS=cuda: jax finds no such device{why}; ")
+    assert list(tmp_path.iterdir()) == [] and loop.calls == []
+
+
+def test_the_entry_point_refuses_a_device_in_one_line(tmp_path):
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "experiments.train",
+            "--game=Catch",
+            "--tune_runtime=off",
+            f"--out={tmp_path}/a",
+        ],
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "nonsense"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: JAX_PLATFORMS=nonsense: jax finds no such device (")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_the_entry_point_prints_its_config():
     done = _python("-m", "experiments.train", "--preset=thesis/joint_256", "--print_config")
     assert (done.returncode, done.stderr) == (0, "")
