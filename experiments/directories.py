@@ -65,26 +65,51 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
 
 
 def blank(path: Path) -> bool:
-    """Whether nothing lies there, or only what a process left that was killed before it wrote config.json."""
+    """Whether nothing lies there, or only what a process left that ended before its run's first row."""
+    if not path.is_dir():
+        return True
+    begun = _is_config(path / "config.json")
+    rows = path / "metrics.jsonl"
+    unwritten = begun and rows.is_file() and not rows.stat().st_size
 
     def left(entry: Path) -> bool:
         if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
             return blank(entry)
-        return entry.name in (rundir.LOCK, PARTIAL)
+        if entry.name in (rundir.LOCK, PARTIAL):
+            return True
+        if entry.is_symlink() or not begun:
+            return False
+        if entry.name == "encoders":  # what diagnostics keep of the first evaluation
+            return unwritten and all(kept.name == f"{0:09d}" for kept in _finished(entry))
+        if entry.name == "checkpoints":
+            return unwritten and not _finished(entry)
+        return entry.name == "config.json" or (unwritten and entry.name in ("metrics.jsonl", "tensorboard"))
 
-    return not path.is_dir() or all(left(entry) for entry in path.iterdir())
+    return all(left(entry) for entry in path.iterdir())
+
+
+def _finished(folder: Path) -> list[Path]:
+    """What lies in a folder of checkpoints, but for what was not written to its end."""
+    return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+
+
+def say_anew(path: Path) -> None:
+    """Says that the run of a directory without a checkpoint begins again, if one has begun there."""
+    if (path / "config.json").exists():
+        say(f"{path}: no checkpoint there yet; the run begins again")
 
 
 def _is_run(path: Path) -> bool:
     """Whether the directory, or one of seeds in it, holds a config.json that this program wrote."""
-    for file in (path / "config.json", *sorted(path.glob("seed*/config.json"))):
-        try:
-            values = parse_json(read_bytes(file, SETTINGS))
-        except (OSError, ValueError):
-            continue
-        if isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys():
-            return True
-    return False
+    return any(map(_is_config, (path / "config.json", *sorted(path.glob("seed*/config.json")))))
+
+
+def _is_config(file: Path) -> bool:
+    try:
+        values = parse_json(read_bytes(file, SETTINGS))
+    except (OSError, ValueError):
+        return False
+    return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()
 
 
 @contextlib.contextmanager
@@ -146,12 +171,16 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
         ConfigError: another process writes there, or the run has another configuration, or its checkpoints
             are all damaged, or gone though there were some.
     """
-    if blank(path):
-        return None
     rundir.check_free(path)
+    if blank(path):
+        say_anew(path)
+        return None
     there = Config.load(path)
     if differing := another_run(there, config):
-        raise ConfigError(f"--out={path}: the run there has another configuration: {differing}")
+        raise ConfigError(
+            f"--out={path}: the run there has another configuration: {differing}; go on with its own, name "
+            "another directory, or --overwrite without --resume starts anew"
+        )
     manifest = checkpoint.newest_good(path, say, at_most)
     if manifest is None:
         if (steps := reached(path)) >= first_checkpoint(config):
@@ -159,7 +188,7 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
                 f"--out={path}: the run there got to {steps} env steps, and there is no checkpoint that it "
                 "could go on from; --overwrite would start anew"
             )
-        say(f"{path}: no checkpoint there yet; the run begins again")
+        say_anew(path)
         return None
     if differing := another_run(manifest.config, config):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
@@ -206,7 +235,8 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
         if None in found:
             first, config = runs[found.index(None)]
             for (path, _), manifest in zip(runs, found, strict=True):
-                if manifest and (blank(first) or manifest.env_steps >= first_checkpoint(config)):
+                never = not (first / "config.json").exists()
+                if manifest and (never or manifest.env_steps >= first_checkpoint(config)):
                     raise ConfigError(
                         f"--out={first}: no checkpoint there to go on from, while {path} has one of "
                         f"{manifest.env_steps} env steps; --overwrite would start all of them anew"

@@ -18,7 +18,7 @@ from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
-from experiments.directories import all_to_resume, check_out, going_on, run_directory
+from experiments.directories import all_to_resume, check_out, going_on, run_directory, say_anew
 from experiments.stopping import signals
 from srl_jax import display
 from srl_jax.config import INFOS, SOURCES, Config, resolve
@@ -174,6 +174,9 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
     check_paths(needed)
     checkpoint.check_sources(needed)
+    if not resume and not values["overwrite"].value:
+        for directory, _ in runs:
+            say_anew(directory)
     with contextlib.ExitStack() as stack:
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
             holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)

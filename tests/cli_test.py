@@ -312,6 +312,24 @@ def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
     assert "--resume=auto goes on with the run" in _refused(capsys, *CATCH[1:], f"--out={out}")
 
 
+def test_a_start_that_failed_is_in_nobodys_way(capsys, loop, tmp_path, monkeypatch):
+    def failed(config, out, **_):
+        (out / "metrics.jsonl").touch()
+        raise RuntimeError("a mistake")
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "train", failed)
+        with pytest.raises(RuntimeError):
+            _train(*CATCH, "--n_step=7", f"--out={out}")
+    assert (out / "config.json").exists()
+    capsys.readouterr()
+    for arguments in ([], ["--resume=auto"]):
+        assert _train(*CATCH, "--n_step=6", f"--out={out}", *arguments) == 0
+        assert "n_step=6" in Config.load(out).rl
+        assert capsys.readouterr().err == (f"resume: {out}: no checkpoint there yet; the run begins again\n")
+
+
 def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     out = tmp_path / "run"
     _train(*CATCH, f"--out={out}")

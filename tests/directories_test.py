@@ -260,6 +260,52 @@ def test_a_process_that_was_killed_as_it_began_is_in_nobodys_way(tmp_path, kind,
     assert Config.load(path) == CONFIG
 
 
+@pytest.mark.parametrize("kind", ["config", "rows", "encoder", "half a checkpoint", "seeds"])
+@pytest.mark.parametrize("resume", [True, False])
+def test_a_run_that_ended_before_its_first_row_is_begun_anew(tmp_path, capsys, kind, resume):
+    path = tmp_path / "run"
+    other = dataclasses.replace(CONFIG, gamma=0.5)
+    run = path / "seed0" if kind == "seeds" else path
+    make(run, other)
+    if kind == "config":
+        (run / "metrics.jsonl").unlink()
+    elif kind == "encoder":
+        counts = {"num_actions": 3, "env_steps": 0, "updates": 0}
+        checkpoint.save(run, PARAMS, other, folder="encoders", keep=0, **counts)
+        (run / "tensorboard").mkdir()
+    elif kind == "half a checkpoint":
+        (run / "checkpoints" / ".000000100.partial").mkdir(parents=True)
+    assert check_out(str(path), CONFIG, overwrite=False, resume=resume) == path
+    assert to_resume(run, CONFIG) is None
+    assert capsys.readouterr().err == f"resume: {run}: no checkpoint there yet; the run begins again\n"
+    with run_directory(run, CONFIG):
+        assert set(contents(run)) == {"config.json", "lock"}
+    assert Config.load(run) == CONFIG
+
+
+@pytest.mark.parametrize("kind", ["a row", "a checkpoint", "an encoder", "encoders alone", "notes", "a link"])
+def test_what_a_run_has_written_is_kept(tmp_path, kind):
+    path = tmp_path / "run"
+    make(path, reached=0 if kind == "a row" else None)
+    counts = {"num_actions": 3, "updates": 0, "keep": 0}
+    if kind == "a checkpoint":
+        checkpoint.save(path, PARAMS, CONFIG, env_steps=4, **counts)
+    elif "encoder" in kind:
+        step = 4 if kind == "an encoder" else 0
+        checkpoint.save(path, PARAMS, CONFIG, env_steps=step, folder="encoders", **counts)
+        if kind == "encoders alone":  # somebody keeps them to start from
+            (path / "metrics.jsonl").unlink()
+    elif kind == "notes":
+        (path / "notes.txt").write_text("mine")
+    elif kind == "a link":
+        (path / "encoders").symlink_to(tmp_path)
+    with pytest.raises(ConfigError, match="not empty; name a new directory"):
+        check_out(str(path), CONFIG, overwrite=False, resume=False)
+    if kind != "a checkpoint":
+        with pytest.raises(ConfigError, match="another configuration: gamma .*; go on with its own"):
+            to_resume(path, dataclasses.replace(CONFIG, gamma=0.5))
+
+
 @pytest.mark.parametrize("file", ["notes.txt", "seed0", "seed0/notes.txt", "seed1/config.json"])
 def test_a_directory_with_anything_else_is_somebodys(tmp_path, file):
     path = tmp_path / "run"

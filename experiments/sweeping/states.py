@@ -79,7 +79,7 @@ def look(path: Path, config: Config) -> State:
     except ConfigError as error:
         return State("busy", reason=_without_flag(error))
     if blank:
-        return State("missing")
+        return State("resumable" if (path / "config.json").exists() else "missing")
     if problem:
         return State("broken", reason=problem)
     try:
