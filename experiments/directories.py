@@ -4,22 +4,21 @@ import contextlib
 import os
 import re
 import shutil
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 from experiments import flags as config_flags
-from srl_jax import checkpoint, ending, rundir
+from srl_jax import checkpoint, display, ending, rundir
 from srl_jax.checkpoint import Manifest
-from srl_jax.config import PARTIAL, Config, difference, told_to_xla
+from srl_jax.config import PARTIAL, SOURCES, Config, another_run, changes, record_changes
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import read_metrics
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
 
 def say(line: str) -> None:
-    """A line for whoever watches, on stderr."""
-    print(f"resume: {line}", file=sys.stderr)
+    """A line about going on, for whoever watches."""
+    display.say(f"resume: {line}")
 
 
 def runs_below(root: Path) -> list[Path]:
@@ -119,26 +118,51 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
 
 
 def blank(path: Path) -> bool:
-    """Whether nothing lies there, or only what a process left that was killed before it wrote config.json."""
+    """Whether nothing lies there, or only what a process left that ended before its run's first row."""
+    if not path.is_dir():
+        return True
+    begun = _is_config(path / "config.json")
+    rows = path / "metrics.jsonl"
+    unwritten = begun and rows.is_file() and not rows.stat().st_size
 
     def left(entry: Path) -> bool:
         if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
             return blank(entry)
-        return entry.name in (rundir.LOCK, PARTIAL)
+        if entry.name in (rundir.LOCK, PARTIAL):
+            return True
+        if entry.is_symlink() or not begun:
+            return False
+        if entry.name == "encoders":  # what diagnostics keep of the first evaluation
+            return unwritten and all(kept.name == f"{0:09d}" for kept in _finished(entry))
+        if entry.name == "checkpoints":
+            return unwritten and not _finished(entry)
+        return entry.name == "config.json" or (unwritten and entry.name in ("metrics.jsonl", "tensorboard"))
 
-    return not path.is_dir() or all(left(entry) for entry in path.iterdir())
+    return all(left(entry) for entry in path.iterdir())
+
+
+def _finished(folder: Path) -> list[Path]:
+    """What lies in a folder of checkpoints, but for what was not written to its end."""
+    return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+
+
+def say_anew(path: Path) -> None:
+    """Says that the run of a directory without a checkpoint begins again, if one has begun there."""
+    if (path / "config.json").exists():
+        say(f"{path}: no checkpoint there yet; the run begins again")
 
 
 def _is_run(path: Path) -> bool:
     """Whether the directory, or one of seeds in it, holds a config.json that this program wrote."""
-    for file in (path / "config.json", *sorted(path.glob("seed*/config.json"))):
-        try:
-            values = parse_json(read_bytes(file, SETTINGS))
-        except (OSError, ValueError):
-            continue
-        if isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys():
-            return True
-    return False
+    return any(map(_is_config, (path / "config.json", *sorted(path.glob("seed*/config.json")))))
+
+
+def _is_config(file: Path) -> bool:
+    try:
+        values = parse_json(read_bytes(file, SETTINGS))
+    except (OSError, ValueError):
+        return False
+    return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()
 
 
 @contextlib.contextmanager
@@ -200,11 +224,16 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
         ConfigError: another process writes there, or the run has another configuration, or its checkpoints
             are all damaged, or gone though there were some.
     """
-    if blank(path):
-        return None
     rundir.check_free(path)
-    if differing := difference(Config.load(path), config):
-        raise ConfigError(f"--out={path}: the run there has another configuration: {differing}")
+    if blank(path):
+        say_anew(path)
+        return None
+    there = Config.load(path)
+    if differing := another_run(there, config):
+        raise ConfigError(
+            f"--out={path}: the run there has another configuration: {differing}; go on with its own, name "
+            "another directory, or --overwrite without --resume starts anew"
+        )
     manifest = checkpoint.newest_good(path, say, at_most)
     if manifest is None:
         if (steps := reached(path)) >= first_checkpoint(config):
@@ -212,18 +241,42 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
                 f"--out={path}: the run there got to {steps} env steps, and there is no checkpoint that it "
                 "could go on from; --overwrite would start anew"
             )
-        say(f"{path}: no checkpoint there yet; the run begins again")
+        say_anew(path)
         return None
-    if differing := difference(manifest.config, config):
+    if differing := another_run(manifest.config, config):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
+    if checkpoint.NUMBERS not in manifest.files:
+        return manifest
     with contextlib.suppress(ConfigError):  # it informs and decides nothing
         if (ended := ending.read(path)) is not None and ended.status == "diverged":
             say(f"{path}: ended since {ended.reason}; the same code on the same machine gets there again")
-    about = parse_json(read_bytes(path / "config.json", SETTINGS))
-    then, now = about.get("environment"), told_to_xla()
-    if then != now:
-        say(f"{path}: XLA was told {then} and is told {now} now: roundings differ")
+    for flag in SOURCES:
+        then, now = getattr(there, flag), getattr(config, flag)
+        if then != now:
+            how = "the run goes on with the latter" if flag == "policy_from" else "neither is read any more"
+            say(f"{path}: --{flag} was {then} and is {now}: {how}")
+    if changed := changes(path):
+        what = ", ".join(
+            f"{name} was {then!r:.200} and is {now!r:.200}" for name, (then, now) in changed.items()
+        )
+        say(f"{path}: {what}: results may differ from those of a run that did not end")
     return manifest
+
+
+@contextlib.contextmanager
+def going_on(path: Path, manifest: Manifest) -> Iterator[None]:
+    """Holds the directory of a run that goes on; its config.json gets what has changed since it began.
+
+    Raises:
+        ConfigError: another process writes there.
+        SaveError: config.json could not be written.
+    """
+    with rundir.held(path):
+        try:
+            record_changes(path, manifest.env_steps)
+        except OSError as error:
+            raise SaveError(f"--out={path}: {error.strerror}") from None
+        yield
 
 
 def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
@@ -238,7 +291,8 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
         if None in found:
             first, config = runs[found.index(None)]
             for (path, _), manifest in zip(runs, found, strict=True):
-                if manifest and (blank(first) or manifest.env_steps >= first_checkpoint(config)):
+                never = not (first / "config.json").exists()
+                if manifest and (never or manifest.env_steps >= first_checkpoint(config)):
                     raise ConfigError(
                         f"--out={first}: no checkpoint there to go on from, while {path} has one of "
                         f"{manifest.env_steps} env steps; --overwrite would start all of them anew"

@@ -12,6 +12,7 @@ from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
+from srl_jax import display
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
 
@@ -65,13 +66,16 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     if prepare is not None:
         prepare(FLAGS.tune_runtime, config.encoder)
 
+    runtime.check_device()
+
     import jax
 
     from srl_jax import loop
     from srl_jax.evaluate import evaluate
 
     agent, params, manifest = loop.load_agent(FLAGS.run)
-    env = loop.make_env(config, min(FLAGS.games, config.num_envs), FLAGS.seed)
+    number = min(FLAGS.games, config.num_envs)
+    env = loop.make_env(config, number, FLAGS.seed, max_steps=config.eval_max_steps)
     if manifest.num_actions != env.single_action_space.n:
         raise ConfigError(
             f"{manifest.path}: its policy has {manifest.num_actions} actions, {config.game} has "
@@ -94,11 +98,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         "returns": played.returns,
         "lengths": played.lengths,
     }
-    print(json.dumps(result))
     if FLAGS.gif:
         from experiments import plots
 
         plots.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
+    display.result(json.dumps(result))
 
 
 if __name__ == "__main__":

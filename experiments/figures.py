@@ -24,7 +24,7 @@ from experiments.arms import FIGURES, Figure, figures_named
 from experiments.collect import RunData, comparable, steps_and_returns
 from experiments.colours import styles
 from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
-from srl_jax import statistics
+from srl_jax import display, statistics
 from srl_jax.config import Config
 from srl_jax.data import published, reference_policies
 from srl_jax.envs import ATARI_57
@@ -279,7 +279,7 @@ def run(values: flags.FlagValues) -> int:
     runs = planned(figures, games, seeds, sweep.given_flags(values))
     methods = _known(values["published"].value)
     if values["dry_run"].value:
-        print("\n".join(sweep.dry_run(root, runs, **options)))
+        display.result("\n".join(sweep.dry_run(root, runs, **options)))
         return 0
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 from absl import app, flags
 
 from experiments.presets import ENCODER_PRESETS, PRESETS, preset_values
-from srl_jax import modes, specs
+from srl_jax import display, modes, specs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import EXIT_STATUS, ConfigError
 from srl_jax.specs import Info
@@ -225,7 +225,7 @@ def fail(message: Any, status: int = 2) -> NoReturn:
     if len(line) > LONGEST:
         line = f"{line[: LONGEST // 2]} [...] {line[-LONGEST // 2 :]}"
     line = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-    print("error: " + line, file=sys.stderr)
+    display.say(f"error: {line}")
     sys.exit(status)
 
 
@@ -305,4 +305,5 @@ def run(main: Callable[[list[str]], Any], positional: str | None = None) -> None
     """
     # absl prints what libraries log, and jax logs every accelerator that it does not find.
     logging.getLogger("jax").setLevel(logging.WARNING)
+    display.secure()
     app.run(guarded(main), flags_parser=functools.partial(parse, positional=positional))

@@ -1,6 +1,7 @@
 """The environment that jax and XLA's CPU backend run well in, set before jax is imported.
 
-Only an entry point's `__main__` calls `prepare`; nothing here is for library code. Imports no jax.
+Only an entry point's `__main__` calls `prepare`; nothing here is for library code. To import it imports no
+jax.
 
 jax and XLA read their variables when they are imported or first used, so those are set in `os.environ`.
 glibc and OpenBLAS read theirs when the process starts, so for those alone it replaces itself, once.
@@ -21,6 +22,8 @@ from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 
 from experiments import control_groups
+from srl_jax import display
+from srl_jax.errors import ConfigError
 
 GUARD = "SRL_JAX_RUNTIME"
 """Set in the process that `prepare` started; such a process is not started again."""
@@ -233,7 +236,7 @@ def _write(path: Path, text: str) -> None:
 
 
 def _say(text: str) -> None:
-    print(f"runtime: {text}", file=sys.stderr, flush=True)
+    display.say(f"runtime: {text}")
 
 
 def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ) -> None:
@@ -263,7 +266,8 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
     hint = "(--tune_runtime=off leaves the environment alone)"
     if _AT_START.keys() & new.keys() and GUARD not in env and sys.executable:
         _say(f"restarting with {_shown(new)} {hint}")
-        sys.stdout.flush()
+        if sys.stdout is not None:
+            sys.stdout.flush()
         try:
             os.execve(sys.executable, [sys.executable, *sys.orig_argv[1:]], {**env, **new, GUARD: "tuned"})
         except OSError as error:
@@ -272,6 +276,24 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
     if new:
         _say(f"running with {_shown(new)} {hint}")
         env.update(new)
+
+
+def check_device(env: Mapping[str, str] = os.environ) -> None:
+    """Whether jax finds a device of the kind that JAX_PLATFORMS asks for; imports jax.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    import jax
+
+    try:
+        jax.devices()
+    except Exception as error:  # of several kinds, some without a text
+        why = f" ({str(error).splitlines()[0]})" if str(error) else ""
+        raise ConfigError(
+            f"JAX_PLATFORMS={env.get('JAX_PLATFORMS', '')}: jax finds no such device{why}; "
+            "JAX_PLATFORMS=cpu runs on the processor"
+        ) from None
 
 
 def _shown(variables: Mapping[str, str]) -> str:

@@ -2,8 +2,9 @@
 
 A run for each preset, game and seed, and the runs whose encoder or policy these start from, each a process
 with a run directory of its own, --out/GAME/ARM/seedN. Given again, the command runs what is missing or
-broken; with --out alone it goes on with everything that was ever planned there. Ctrl-C and SIGTERM write a
-checkpoint of each run and end. `--status` says how far a sweep is, `--dry_run` what one would do.
+broken; with --out alone it goes on with everything that was ever planned there. Ctrl-C, SIGTERM, SIGHUP and
+SIGUSR1 write a checkpoint of each run and end. `--status` says how far a sweep is, `--dry_run` what one would
+do.
 
 Flags of experiments.train beside these are given to every run, but --steps: pretraining takes 0.3 of it, as
 in the thesis. Bad input ends with one line on stderr and exit status 2 before anything is written. Exit
@@ -21,7 +22,7 @@ from experiments.sweeping import launching, local, machine, manifest, plan, reso
 from experiments.sweeping.launching import Launcher, Outcome
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
-from srl_jax import rundir
+from srl_jax import display, rundir
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import hms
@@ -288,11 +289,11 @@ def main(argv: list[str]) -> int:
         if not entries:
             raise ConfigError(f"--out={FLAGS.out}: no sweep there (no {manifest.FILE})")
         workers = options["workers"] or machine.most_workers()
-        print("\n".join(table.status(root, entries, workers)))
+        display.result("\n".join(table.status(root, entries, workers)))
         return 0
     runs = chosen_runs(FLAGS, root)
     if FLAGS.dry_run:
-        print("\n".join(dry_run(root, runs, **options)))
+        display.result("\n".join(dry_run(root, runs, **options)))
         return 0
     try:
         outcome = run_sweep(root, runs, **options)

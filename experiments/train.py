@@ -1,7 +1,8 @@
 """Trains one agent: `python -m experiments.train --preset=thesis/joint_256 --out=runs/pong`.
 
 Bad input ends with one line on stderr and exit status 2 before anything is written. What can be checked
-without jax is checked before jax is imported. Ctrl-C and SIGTERM write a checkpoint and end the run.
+without jax is checked before jax is imported. Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 write a checkpoint and end
+the run; a second Ctrl-C or SIGTERM ends it at once.
 """
 
 import contextlib
@@ -10,19 +11,19 @@ import functools
 import importlib.util
 import os
 import signal
-import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 from absl import flags
 
 from experiments import flags as config_flags
 from experiments import runtime
-from experiments.directories import all_to_resume, check_out, run_directory
-from srl_jax.config import INFOS, Config, resolve
+from experiments.directories import all_to_resume, check_out, going_on, run_directory, say_anew
+from experiments.stopping import signals
+from srl_jax import display
+from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.rundir import check_free, held
+from srl_jax.rundir import check_free
 from srl_jax.specs import build, parse
 
 FLAGS = flags.FLAGS
@@ -96,31 +97,15 @@ def check_paths(config: Config) -> None:
     Raises:
         ConfigError: one does not.
     """
-    for flag in ("encoder_from", "policy_from"):
+    for flag in SOURCES:
         path = getattr(config, flag)
         if path and not os.path.exists(path):
             raise ConfigError(f"--{flag}={path}: no such path; give a run directory or a checkpoint")
 
 
-@contextlib.contextmanager
-def stopping() -> Iterator[list[int]]:
-    """A list that gets the signal when Ctrl-C or SIGTERM comes; a second one interrupts at once."""
-    caught: list[int] = []
-
-    def handle(number: int, frame: Any) -> None:
-        if caught:
-            raise KeyboardInterrupt
-        caught.append(number)
-
-    if threading.current_thread() is not threading.main_thread():  # which has the signals
-        yield caught
-        return
-    old = {number: signal.signal(number, handle) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        yield caught
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
+def interrupt() -> None:
+    """Ends a run in the middle of a step, without another checkpoint."""
+    raise KeyboardInterrupt
 
 
 def resolved(config: Config) -> Config:
@@ -162,7 +147,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     """
     config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
     if values["print_config"].value:
-        print(resolved(config).to_json())
+        display.result(resolved(config).to_json())
         return 0
     seeds = check_seeds(values)
     resume = values["resume"].value == "auto"
@@ -170,24 +155,33 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     for directory in [path / f"seed{seed}" for seed in seeds] or [path]:
         check_free(directory)
     check_extras(config)
-    check_paths(config)
+    if not resume:
+        check_paths(config)
     if prepare is not None:
         prepare(values["tune_runtime"].value, config.encoder)
+    runtime.check_device()
     config = resolved(config)
 
     from srl_jax import checkpoint, loop
 
-    checkpoint.check_sources(config)
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs) if resume else [None] * len(runs)
     if all(m is not None and checkpoint.NUMBERS not in m.files for m in manifests):
         print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
         return 0
+    # A checkpoint has the encoder; the policy that others are pretrained on is read again.
+    needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
+    check_paths(needed)
+    checkpoint.check_sources(needed)
+    if not resume and not values["overwrite"].value:
+        for directory, _ in runs:
+            say_anew(directory)
     with contextlib.ExitStack() as stack:
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
-            stack.enter_context(held(directory) if manifest else run_directory(directory, its_config))
-        caught = stack.enter_context(stopping())
+            holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)
+            stack.enter_context(holding)
+        caught = stack.enter_context(signals(again=interrupt))
         if seeds:
             from srl_jax import lockstep
 

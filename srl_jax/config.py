@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from srl_jax import modes, specs
-from srl_jax.envs import GAMES
+from srl_jax.envs import FRAME_SKIP, GAMES
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import Info
@@ -25,8 +25,13 @@ from srl_jax.specs import Info
 _PACKAGES = (
     "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
 )  # fmt: skip
-_ABOUT = ("versions", "git_revision", "environment", "started", "cpus")
+_MADE_BY = ("versions", "git_revision", "environment", "cpus")
+"""What config.json says of the software and the machine that made a run."""
+_ABOUT = (*_MADE_BY, "started", "continued")
 """What config.json holds beside the fields of Config."""
+
+SOURCES = ("encoder_from", "policy_from")
+"""The fields that name another run."""
 
 PARTIAL = "config.json.partial"
 """The name under which it is written, so that no process that is killed leaves half of it."""
@@ -131,7 +136,10 @@ class Config:
 
     eval_every: int = _steps(100_000, "how often the policy is evaluated (one epoch)")
     eval_games: int = _value(int, 10, "full games of one evaluation", "games", minimum=1)
-    eval_max_steps: int = _steps(27_000, "longest evaluation game (27,000 are 108,000 frames)")
+    eval_max_steps: int = _value(
+        int, 27_000, "longest evaluation game (27,000 are 108,000 frames)", "env steps",
+        minimum=1, maximum=specs.LIMITS[int] // FRAME_SKIP,
+    )  # fmt: skip
     stop_at_return: float | None = _value(
         float, None, "mean evaluation return that ends the run early, or off", "unclipped score",
         optional=True,
@@ -257,17 +265,9 @@ class Config:
 
     def save(self, run: str | Path) -> None:
         """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told; also
-        when the run began (UTC), and how many CPUs the machine has.
+        when the run began (UTC), and how many CPUs the machine has. `record_changes` adds to it.
         """
-        about = {"versions": versions(), "git_revision": git_revision(), "environment": told_to_xla()}
-        about |= {"started": time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime()), "cpus": os.cpu_count()}
-        text = json.dumps({**dataclasses.asdict(self), **about}, indent=2)
-        partial = Path(run) / PARTIAL
-        with open(partial, "w", encoding="utf-8") as file:
-            file.write(text + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, Path(run) / "config.json")
+        _write(run, {**dataclasses.asdict(self), **_made_by(), "started": _now()})
 
 
 INFOS: dict[str, Info] = {f.name: f.metadata["info"] for f in dataclasses.fields(Config)}
@@ -310,6 +310,96 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
     """What differs of these fields, `steps is 1000 there and 2000 here, ...`; "" if nothing."""
     pairs = ((name, getattr(there, name), getattr(here, name)) for name in names)
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
+
+
+def another_run(there: Config, here: Config) -> str:
+    """`difference` of what makes two runs two: the runs that they start from may lie elsewhere by now."""
+    same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
+    return difference(there, dataclasses.replace(here, **same))
+
+
+def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:
+    """What made a run: {package, environment variable, "git_revision" or "cpus": its values, oldest first}.
+
+    Args:
+        about: the content of config.json. What it does not say at all is left out.
+
+    Raises:
+        ValueError, TypeError, KeyError, AttributeError: it is not what training writes.
+    """
+    found = {name: [value] for name, value in _flat(about).items()}
+    for continued in about.get("continued", []):
+        for name, value in continued["changed"].items():
+            found.setdefault(name, [None]).append(value)
+    return found
+
+
+def changes(run: str | Path) -> dict[str, tuple[Any, Any]]:
+    """What is different now of what made a run: {name: (then, now)}, as of `history`; None for nothing.
+
+    Raises:
+        ConfigError: config.json is not what training writes.
+    """
+    about, past = _read(run)
+    then = {name: values[-1] for name, values in past.items()}
+    now = _flat({name: value for name, value in _made_by().items() if name in about})
+    pairs = {name: (then.get(name), now.get(name)) for name in {**then, **now}}
+    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
+
+
+def record_changes(run: str | Path, env_steps: int) -> None:
+    """Adds `changes` to a run's config.json, under "continued"; writes nothing where there are none.
+
+    Args:
+        run: its directory, held by this process.
+        env_steps: from which it goes on.
+
+    Raises:
+        ConfigError: config.json is not what training writes.
+        OSError: it could not be written.
+    """
+    if changed := {name: now for name, (_, now) in changes(run).items()}:
+        about, _ = _read(run)
+        continued = {"env_steps": env_steps, "started": _now(), "changed": changed}
+        _write(run, {**about, "continued": [*about.get("continued", []), continued]})
+
+
+def _read(run: str | Path) -> tuple[dict[str, Any], dict[str, list[Any]]]:
+    """The content of config.json and its `history`."""
+    path = Path(run) / "config.json"
+    try:
+        about = parse_json(read_bytes(path, SETTINGS))
+        return about, history(about)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except (ValueError, TypeError, KeyError, AttributeError):
+        raise ConfigError(f"{path}: what it says of versions is not what training writes") from None
+
+
+def _write(run: str | Path, content: Mapping[str, Any]) -> None:
+    partial = Path(run) / PARTIAL
+    with open(partial, "w", encoding="utf-8") as file:
+        file.write(json.dumps(content, indent=2) + "\n")
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, Path(run) / "config.json")
+
+
+def _now() -> str:
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime())
+
+
+def _made_by() -> dict[str, Any]:
+    values = versions(), git_revision(), told_to_xla(), os.cpu_count()
+    return dict(zip(_MADE_BY, values, strict=True))
+
+
+def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name in _MADE_BY:
+        if name in about:
+            found |= about[name] if isinstance(about[name], dict) else {name: about[name]}
+    return found
 
 
 def told_to_xla() -> dict[str, str]:

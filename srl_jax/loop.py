@@ -112,8 +112,16 @@ def act_and_step(policy: Policy, observations: np.ndarray, step: int, epsilon: f
     return actions, env.step(actions)
 
 
-def make_env(config: Config, num_envs: int, seed: int):
-    """The environments of a run's game and protocol, see `srl_jax.envs.make`."""
+def make_env(config: Config, num_envs: int, seed: int, *, max_steps: int = 0):
+    """The environments of a run's game and protocol, see `srl_jax.envs.make`.
+
+    Args:
+        config: of the run.
+        num_envs: how many.
+        seed: of the environments.
+        max_steps: env steps that an episode must be allowed to take; those of training end where
+            `srl_jax.envs.MAX_FRAMES` says.
+    """
     return envs.make(
         config.game,
         num_envs=num_envs,
@@ -121,6 +129,7 @@ def make_env(config: Config, num_envs: int, seed: int):
         frame_size=config.frame_size,
         sticky_actions=config.sticky_actions,
         noop_max=config.noop_max,
+        max_frames=max(envs.MAX_FRAMES, envs.FRAME_SKIP * max_steps),
     )
 
 
@@ -193,7 +202,7 @@ class Run:
         self.agent = agent or make_agent(config, self.num_actions)
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.key = jax.random.key(config.seed)
-        self.state = self.agent.init(self.key, self.initial_params())
+        self.state = self.agent.init(self.key, self.initial_params() if resume is None else None)
         frame = self.env.single_observation_space.shape
         try:
             self.replay = Replay(
@@ -543,7 +552,9 @@ class Run:
 
     def make_env(self, purpose: str, num_envs: int):
         """Environments with seeds of their own for this purpose."""
-        return make_env(self.config, num_envs, seed_for(self.config.seed, purpose, "environments"))
+        seed = seed_for(self.config.seed, purpose, "environments")
+        max_steps = self.config.eval_max_steps if purpose == "eval" else 0
+        return make_env(self.config, num_envs, seed, max_steps=max_steps)
 
     def initial_params(self) -> dict[str, Params]:
         """{group: tree} of what starts from another run: the encoder, and heads as `heads_from` says."""

@@ -8,6 +8,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any, TextIO
 
+from srl_jax.display import Display
+
 BAR_WIDTH = 20
 RATE_WINDOW_S = 10.0
 """Shortest stretch of time, in seconds, that the rate is taken over."""
@@ -23,7 +25,7 @@ class Progress:
     Args:
         total: what `done` will be at the end.
         unit: what `done` counts; its last word names the rate ("steps/s").
-        stream: where to draw.
+        stream: where to draw; None for stderr.
         clock: seconds, monotonic.
         width: of the terminal, in characters; None asks the terminal each time.
     """
@@ -38,10 +40,10 @@ class Progress:
     ):
         self._total = total
         self._unit = unit
-        self._stream = sys.stderr if stream is None else stream
+        self._stream = Display(sys.stderr if stream is None else stream)
         self._clock = clock
         self._width = width
-        self._tty = bool(getattr(self._stream, "isatty", lambda: False)())
+        self._tty = self._stream.isatty()
         self._interval = 0.25 if self._tty else 10.0
         self._done = 0
         self._fields: dict[str, Any] = {}

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from srl_jax.display import Display
 from srl_jax.errors import SaveError
 from srl_jax.metrics import Mark, MetricsWriter
 from srl_jax.progress import Progress
@@ -91,7 +92,7 @@ class Report:
     def __init__(self, out: Path, total: int, fetch: Callable, *, progress: bool, tensorboard: bool):
         self.path = Path(out or ".") / "metrics.jsonl"
         self._events = self.path.parent / "tensorboard" if tensorboard else None
-        self.progress = Progress(total, stream=None if progress else _Nowhere())
+        self.progress = Progress(total, stream=None if progress else Display(None))
         self.means = Means(fetch)
         self._started = time.perf_counter()
         self._return_sum, self._episodes = 0.0, 0  # of training episodes that ended since the last row
@@ -203,13 +204,3 @@ def _count(value: Any) -> int:
     if not 0 <= value < 2**63:
         raise ValueError(f"out of range: {value}")
     return value
-
-
-class _Nowhere:
-    """A stream that takes everything and shows nothing."""
-
-    def write(self, text: str) -> None:
-        pass
-
-    def flush(self) -> None:
-        pass

@@ -2,6 +2,7 @@
 
 import contextlib
 import fcntl
+import functools
 import json
 import os
 import platform
@@ -9,6 +10,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from srl_jax import display
 from srl_jax.errors import ConfigError
 
 LOCK = "lock"
@@ -25,7 +27,7 @@ def check_free(run: Path) -> None:
     except OSError:
         return
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        _lock(descriptor, fcntl.LOCK_SH)
     except BlockingIOError:
         raise _refusal(run, descriptor) from None
     finally:
@@ -36,7 +38,8 @@ def check_free(run: Path) -> None:
 def held(run: Path) -> Iterator[None]:
     """Holds a run directory, which exists, for this process.
 
-    The lock goes with the process, however it ends; the file only says who has it.
+    The lock goes with the process, however it ends; the file only says who has it. On a file system without
+    locks a line says that nothing keeps another process away.
 
     Raises:
         ConfigError: another process holds it; the line says which one.
@@ -48,7 +51,7 @@ def held(run: Path) -> Iterator[None]:
         except OSError as error:
             raise ConfigError(f"{path}: {error.strerror}") from None
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            without = _lock(descriptor, fcntl.LOCK_EX)
         except BlockingIOError:
             refusal = _refusal(run, descriptor)
             os.close(descriptor)
@@ -58,6 +61,8 @@ def held(run: Path) -> Iterator[None]:
             if os.path.samestat(os.fstat(descriptor), os.stat(path)):
                 break
         os.close(descriptor)
+    if without:
+        _say_without(without, os.fstat(descriptor).st_dev)
     try:
         about = {"pid": os.getpid(), "host": platform.node(), "since": time.strftime("%Y-%m-%d %H:%M:%S")}
         with contextlib.suppress(OSError):  # a full disk: the lock holds all the same
@@ -68,6 +73,27 @@ def held(run: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             path.unlink()
         os.close(descriptor)
+
+
+def _lock(descriptor: int, how: int) -> str:
+    """Locks a file, or says why there are no locks where it lies; "" where it is locked.
+
+    Raises:
+        BlockingIOError: another process has it.
+    """
+    try:
+        fcntl.flock(descriptor, how | fcntl.LOCK_NB)
+    except BlockingIOError:
+        raise
+    except OSError as error:  # ENOSYS, ENOLCK, EOPNOTSUPP, ...: Lustre, NFS and others, as they are mounted
+        return error.strerror
+    return ""
+
+
+@functools.cache
+def _say_without(why: str, device: int) -> None:
+    """Said once of a file system, which a sweep has many runs on."""
+    display.say(f"lock: run directories are not locked ({why}): see to it that no two processes write to one")
 
 
 def _refusal(run: Path, descriptor: int) -> ConfigError:

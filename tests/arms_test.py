@@ -88,7 +88,7 @@ def test_a_figure_of_ones_own(tmp_path):
         ),
         (
             {"arms": [{**GOOD["arms"][0], "flags": {"lr": 1}}]},
-            "arm 1: no flag 'lr'; did you mean lr_encoder or lr_encoder_srl or lr_final or lr_rl or lr_srl? python -m",
+            "arm 1: no flag 'lr'; did you mean lr_encoder or lr_encoder_srl or lr_final or lr_rl or lr_srl?",
         ),
         ({"arms": [{**GOOD["arms"][0], "flags": {"qqq": 1}}]}, "arm 1: no flag 'qqq'; python -m experiments"),
         (

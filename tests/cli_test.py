@@ -345,6 +345,24 @@ def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
     assert "--resume=auto goes on with the run" in _refused(capsys, *CATCH[1:], f"--out={out}")
 
 
+def test_a_start_that_failed_is_in_nobodys_way(capsys, loop, tmp_path, monkeypatch):
+    def failed(config, out, **_):
+        (out / "metrics.jsonl").touch()
+        raise RuntimeError("a mistake")
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "train", failed)
+        with pytest.raises(RuntimeError):
+            _train(*CATCH, "--n_step=7", f"--out={out}")
+    assert (out / "config.json").exists()
+    capsys.readouterr()
+    for arguments in ([], ["--resume=auto"]):
+        assert _train(*CATCH, "--n_step=6", f"--out={out}", *arguments) == 0
+        assert "n_step=6" in Config.load(out).rl
+        assert capsys.readouterr().err == (f"resume: {out}: no checkpoint there yet; the run begins again\n")
+
+
 def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     out = tmp_path / "run"
     _train(*CATCH, f"--out={out}")
@@ -366,6 +384,43 @@ def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     assert "not a run directory, so --resume=auto cannot go on from it" in line
     assert [p.name for p in foreign.iterdir()] == ["notes.txt"]
     assert len(loop.calls) == 1
+
+
+def test_a_run_goes_on_without_the_one_that_it_started_from(capsys, loop, tmp_path):
+    pre, out = tmp_path / "pre", tmp_path / "run"
+    objective = "--objective=reconstruction"
+    _train(*CATCH, "--mode=pretrain", objective, f"--out={pre}")
+    _checkpoint(pre, 500, ended=True)
+    frozen = [*CATCH, "--mode=frozen", f"--out={out}", "--resume=auto"]
+    _train(*frozen, f"--encoder_from={pre}")
+    made = _checkpoint(out, 200)
+    pre.rename(tmp_path / "moved")
+    capsys.readouterr()
+    for source in (pre, tmp_path / "moved", os.path.relpath(tmp_path / "moved")):
+        assert _train(*frozen, f"--encoder_from={source}") == 0
+        assert loop.resumed[-1] == made
+        said = capsys.readouterr().err
+        assert ("neither is read any more" in said) == (source != pre) and said.count("\n") <= 1
+    # What has to begin needs it.
+    line = _refused(
+        capsys, *CATCH[1:], "--mode=frozen", f"--encoder_from={pre}", "--resume=auto", f"--out={tmp_path}/new"
+    )
+    assert f"--encoder_from={pre}: no such path" in line and not (tmp_path / "new").exists()
+
+
+def test_pretraining_goes_on_with_the_policy_that_it_needs(capsys, loop, tmp_path):
+    policy, out = tmp_path / "policy", tmp_path / "run"
+    _train(*CATCH, f"--out={policy}")
+    _checkpoint(policy, 500, ended=True)
+    pretrain = [*CATCH, "--mode=pretrain", "--objective=reconstruction", f"--out={out}", "--resume=auto"]
+    _train(*pretrain, f"--policy_from={policy}")
+    made = _checkpoint(out, 200)
+    policy.rename(tmp_path / "moved")
+    capsys.readouterr()
+    line = _refused(capsys, *pretrain[1:], f"--policy_from={policy}")
+    assert line == (f"error: --policy_from={policy}: no such path; give a run directory or a checkpoint\n")
+    assert _train(*pretrain, f"--policy_from={tmp_path}/moved") == 0 and loop.resumed[-1] == made
+    assert "the run goes on with the latter" in capsys.readouterr().err
 
 
 def test_two_processes_do_not_write_one_run(capsys, loop, tmp_path):
@@ -410,20 +465,23 @@ def test_seeds_go_on_together(capsys, loop, tmp_path, monkeypatch):
     assert "seed1: no checkpoint there" in line
 
 
-def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkeypatch):
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkeypatch, number):
     def stopped(config, out, *, resume, stop):
         assert not stop()
         (out / "metrics.jsonl").touch()
-        os.kill(os.getpid(), signal.SIGTERM)
+        os.kill(os.getpid(), number)
         assert stop()
-        with pytest.raises(KeyboardInterrupt):  # the second one does not wait
+        if number != signal.SIGTERM:
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):  # who asks twice does not wait
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(10)
         return types.SimpleNamespace(env_steps=40, updates=0, interrupted=True, pictures={}, recording=None)
 
     monkeypatch.setattr(loop, "train", stopped)
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    assert _train(*CATCH, f"--out={tmp_path}/run") == 128 + signal.SIGTERM
+    assert _train(*CATCH, f"--out={tmp_path}/run") == 128 + number
     assert capsys.readouterr().out.endswith(
         f"stopped after 40 env steps; --resume=auto goes on from there, in {tmp_path}/run\n"
     )
@@ -511,6 +569,44 @@ def test_the_entry_point_refuses_an_option_in_one_line(tmp_path):
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr.startswith("error: --rl=rainbow:v_min=20")
     assert done.stderr.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unable to initialize\nmore")])
+def test_a_device_that_is_not_there_is_refused_before_anything_is_written(
+    capsys, loop, tmp_path, monkeypatch, error
+):
+    import jax
+
+    def devices():
+        raise error
+
+    monkeypatch.setattr(jax, "devices", devices)
+    monkeypatch.setenv("JAX_PLATFORMS", "cuda")
+    line = _refused(capsys, f"--out={tmp_path}/a")
+    why = " (Unable to initialize)" if str(error) else ""
+    assert line.startswith(f"error: JAX_PLATFORMS=cuda: jax finds no such device{why}; ")
+    assert list(tmp_path.iterdir()) == [] and loop.calls == []
+
+
+def test_the_entry_point_refuses_a_device_in_one_line(tmp_path):
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "experiments.train",
+            "--game=Catch",
+            "--tune_runtime=off",
+            f"--out={tmp_path}/a",
+        ],
+        cwd=ROOT,
+        env={**os.environ, "JAX_PLATFORMS": "nonsense"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == 1
+    assert done.stderr.startswith("error: JAX_PLATFORMS=nonsense: jax finds no such device (")
     assert list(tmp_path.iterdir()) == []
 
 

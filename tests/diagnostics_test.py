@@ -1,5 +1,6 @@
 """srl_jax/diagnostics: the measures against hand-worked numbers, and what they may not change."""
 
+import hashlib
 import json
 import threading
 from types import SimpleNamespace
@@ -230,6 +231,41 @@ def test_held_out_observations_are_the_games_and_know_its_state():
     # And it moves as the state says, but for bounces.
     nexts = heldout.collect(Config(**SMALL), 1).windows
     assert np.array_equal(nexts.frames[:, 3], held_out.observations[:, -1])
+
+
+@pytest.mark.parametrize("horizon", [7, 20, 60])
+def test_held_out_windows_may_reach_far(horizon):
+    config = Config(**SMALL)
+    near, far = heldout.collect(config, 3), heldout.collect(config, horizon)
+    assert far.windows.frames.shape == (heldout.WINDOWS, 4 + horizon, 42, 42)
+    assert far.windows.valid.shape == (heldout.WINDOWS, horizon)
+    # The same observations, and windows that go on where shorter ones end.
+    np.testing.assert_array_equal(far.states, near.states)
+    np.testing.assert_array_equal(far.episodes, near.episodes)
+    np.testing.assert_array_equal(far.windows.frames[:, :7], near.windows.frames)
+    for name in ("actions", "rewards", "discounts", "valid"):
+        np.testing.assert_array_equal(getattr(far.windows, name)[:, :3], getattr(near.windows, name))
+
+
+@pytest.mark.parametrize(
+    ("game", "horizon", "sha256"),
+    [
+        ("Catch", 1, "46585e8483e86271"),
+        ("Catch", 3, "6ddf0b23c83d56e5"),
+        ("Pong", 1, "f98af6e98d4306ee"),
+        ("Pong", 3, "2609b23b597fc8ad"),
+    ],
+)
+def test_held_out_observations_are_those_of_runs_before(game, horizon, sha256):
+    # Recorded before windows could reach further than six steps: diagnostics of older runs compare with ours.
+    if game == "Pong":
+        pytest.importorskip("ale_py")
+    held_out = heldout.collect(Config(game=game), horizon)
+    digest = hashlib.sha256()
+    for array in (*held_out.windows, held_out.states, held_out.episodes):
+        digest.update(f"{array.dtype} {array.shape}".encode())
+        digest.update(array.tobytes())
+    assert digest.hexdigest()[:16] == sha256
 
 
 def test_a_generator_of_ones_own_leaves_replays_alone():

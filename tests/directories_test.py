@@ -10,8 +10,9 @@ import numpy as np
 import pytest
 
 from experiments import directories
-from experiments.directories import all_to_resume, check_out, run_directory, to_resume
+from experiments.directories import all_to_resume, check_out, going_on, run_directory, to_resume
 from srl_jax import checkpoint, ending, rundir
+from srl_jax import config as config_module
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
 from tests.helpers import NOT_FINITE, write_run
@@ -96,13 +97,67 @@ def test_another_configuration_is_refused_with_what_differs(tmp_path):
         to_resume(tmp_path / "run", other)
 
 
-def test_xla_that_is_told_something_else_is_said(tmp_path, monkeypatch, capsys):
+def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XLA_FLAGS", "--a")
-    made = make(tmp_path / "run", checkpoints=(100,))
+    monkeypatch.delenv("NPROC", raising=False)
+    run = tmp_path / "run"
+    (made,) = make(run, checkpoints=(100,))
+    began = json.loads((run / "config.json").read_text())
+    assert to_resume(run, CONFIG) == made
+    with going_on(run, made):
+        pass
+    assert capsys.readouterr().err == "" and json.loads((run / "config.json").read_text()) == began
+
+    there = {name: version for name, version in began["versions"].items() if name != "numpy"}
+    (run / "config.json").write_text(json.dumps({**began, "versions": {**there, "jax": "0.1"}, "cpus": 99}))
     monkeypatch.setenv("XLA_FLAGS", "--b")
-    assert to_resume(tmp_path / "run", CONFIG) == made[-1]
-    line = capsys.readouterr().err
-    assert "'XLA_FLAGS': '--a'" in line and "'XLA_FLAGS': '--b'" in line and "roundings differ" in line
+    monkeypatch.setenv("NPROC", "3")
+    monkeypatch.setattr(config_module, "git_revision", lambda: "abc")
+    assert to_resume(run, CONFIG) == made
+    jax, numpy = (began["versions"][name] for name in ("jax", "numpy"))
+    revision, cpus = began["git_revision"], began["cpus"]
+    assert capsys.readouterr().err == (
+        f"resume: {run}: jax was '0.1' and is {jax!r}, git_revision was {revision!r} and is 'abc', XLA_FLAGS "
+        f"was '--a' and is '--b', cpus was 99 and is {cpus}, numpy was None and is {numpy!r}, NPROC was None "
+        "and is '3': results may differ from those of a run that did not end\n"
+    )
+    with going_on(run, made), pytest.raises(ConfigError, match="is writing there"):
+        to_resume(run, CONFIG)
+    said = json.loads((run / "config.json").read_text())
+    assert said["versions"]["jax"] == "0.1" and Config.load(run) == CONFIG
+    (continued,) = said["continued"]
+    changed = {"jax": jax, "git_revision": "abc", "XLA_FLAGS": "--b", "cpus": cpus, "numpy": numpy}
+    assert continued["env_steps"] == 100 and continued["changed"] == changed | {"NPROC": "3"}
+    # From now on that is what it is compared with, and history has both.
+    assert to_resume(run, CONFIG) == made and capsys.readouterr().err == ""
+    assert config_module.history(said)["jax"] == ["0.1", jax]
+    monkeypatch.delenv("NPROC")
+    to_resume(run, CONFIG)
+    assert "NPROC was '3' and is None" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("continued", [1, [1], [{}], [{"changed": 1}]])
+def test_a_history_that_is_none_is_named(tmp_path, continued):
+    make(tmp_path / "run", checkpoints=(100,))
+    path = tmp_path / "run" / "config.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"continued": continued}))
+    with pytest.raises(
+        ConfigError, match="config.json: what it says of versions is not what training writes"
+    ):
+        to_resume(tmp_path / "run", CONFIG)
+
+
+def test_the_run_that_one_started_from_may_lie_elsewhere(tmp_path, capsys):
+    begun = dataclasses.replace(CONFIG, mode="frozen", encoder_from="a/pre")
+    (made,) = make(tmp_path / "run", begun, checkpoints=(100,))
+    moved = dataclasses.replace(begun, encoder_from="/b/pre")
+    assert to_resume(tmp_path / "run", moved) == made
+    line = "--encoder_from was a/pre and is /b/pre: neither is read any more\n"
+    assert capsys.readouterr().err == f"resume: {tmp_path}/run: {line}"
+    # But whether there is one is no matter of its place.
+    scratch = dataclasses.replace(begun, encoder_from="")
+    with pytest.raises(ConfigError, match="another configuration: encoder_from is a/pre there and  here"):
+        to_resume(tmp_path / "run", scratch)
 
 
 def test_a_run_that_diverged_goes_on_and_it_is_said(tmp_path, capsys):
@@ -216,6 +271,52 @@ def test_a_process_that_was_killed_as_it_began_is_in_nobodys_way(tmp_path, kind,
     with run_directory(path, CONFIG):
         assert set(contents(path)) == {"config.json", "lock"}
     assert Config.load(path) == CONFIG
+
+
+@pytest.mark.parametrize("kind", ["config", "rows", "encoder", "half a checkpoint", "seeds"])
+@pytest.mark.parametrize("resume", [True, False])
+def test_a_run_that_ended_before_its_first_row_is_begun_anew(tmp_path, capsys, kind, resume):
+    path = tmp_path / "run"
+    other = dataclasses.replace(CONFIG, gamma=0.5)
+    run = path / "seed0" if kind == "seeds" else path
+    make(run, other)
+    if kind == "config":
+        (run / "metrics.jsonl").unlink()
+    elif kind == "encoder":
+        counts = {"num_actions": 3, "env_steps": 0, "updates": 0}
+        checkpoint.save(run, PARAMS, other, folder="encoders", keep=0, **counts)
+        (run / "tensorboard").mkdir()
+    elif kind == "half a checkpoint":
+        (run / "checkpoints" / ".000000100.partial").mkdir(parents=True)
+    assert check_out(str(path), CONFIG, overwrite=False, resume=resume) == path
+    assert to_resume(run, CONFIG) is None
+    assert capsys.readouterr().err == f"resume: {run}: no checkpoint there yet; the run begins again\n"
+    with run_directory(run, CONFIG):
+        assert set(contents(run)) == {"config.json", "lock"}
+    assert Config.load(run) == CONFIG
+
+
+@pytest.mark.parametrize("kind", ["a row", "a checkpoint", "an encoder", "encoders alone", "notes", "a link"])
+def test_what_a_run_has_written_is_kept(tmp_path, kind):
+    path = tmp_path / "run"
+    make(path, reached=0 if kind == "a row" else None)
+    counts = {"num_actions": 3, "updates": 0, "keep": 0}
+    if kind == "a checkpoint":
+        checkpoint.save(path, PARAMS, CONFIG, env_steps=4, **counts)
+    elif "encoder" in kind:
+        step = 4 if kind == "an encoder" else 0
+        checkpoint.save(path, PARAMS, CONFIG, env_steps=step, folder="encoders", **counts)
+        if kind == "encoders alone":  # somebody keeps them to start from
+            (path / "metrics.jsonl").unlink()
+    elif kind == "notes":
+        (path / "notes.txt").write_text("mine")
+    elif kind == "a link":
+        (path / "encoders").symlink_to(tmp_path)
+    with pytest.raises(ConfigError, match="not empty; name a new directory"):
+        check_out(str(path), CONFIG, overwrite=False, resume=False)
+    if kind != "a checkpoint":
+        with pytest.raises(ConfigError, match="another configuration: gamma .*; go on with its own"):
+            to_resume(path, dataclasses.replace(CONFIG, gamma=0.5))
 
 
 @pytest.mark.parametrize("file", ["notes.txt", "seed0", "seed0/notes.txt", "seed1/config.json"])

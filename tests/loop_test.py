@@ -225,6 +225,33 @@ def test_a_buffer_that_cannot_be_is_refused():
         loop.Run(small, None, False)
 
 
+@pytest.mark.parametrize(("eval_max_steps", "frames"), [(100, 108_000), (27_000, 108_000), (40_000, 160_000)])
+def test_no_evaluation_game_is_cut_before_eval_max_steps(monkeypatch, eval_max_steps, frames):
+    made = []
+    monkeypatch.setattr("srl_jax.envs.make", lambda game, **options: made.append(options["max_frames"]))
+    run = SimpleNamespace(config=Config(game="Pong", eval_max_steps=eval_max_steps))
+    loop.Run.make_env(run, "eval", 1)
+    loop.Run.make_env(run, "train", 1)  # whose episodes are as long as ever
+    assert made == [frames, 108_000]
+
+
+def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypatch, capsys):
+    from experiments import evaluate
+
+    asked, make = [], loop.make_env
+
+    def make_env(*arguments, **options):
+        asked.append(options)
+        return make(*arguments, **options)
+
+    monkeypatch.setattr(loop, "make_env", make_env)
+    given = {"run": str(joint[0]), "games": 1, "seed": 0, "epsilon": None, "gif": "", "tune_runtime": "off"}
+    monkeypatch.setattr(evaluate, "FLAGS", SimpleNamespace(**given))
+    evaluate.main([])
+    assert asked == [{"max_steps": 27_000}]
+    assert len(json.loads(capsys.readouterr().out)["returns"]) == 1
+
+
 def test_a_checkpoint_that_asks_for_what_there_is_not_is_refused_by_its_name(joint, tmp_path):
     path, _ = joint
     shutil.copytree(path, tmp_path / "copy")

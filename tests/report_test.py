@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from absl import flags
 
+from experiments import collect, plots, report
 from experiments import flags as config_flags
-from experiments import plots, report
 from experiments.collect import RunData
-from experiments.reporting import browser
+from experiments.reporting import browser, configs, overview
 from srl_jax import ending
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
@@ -134,6 +134,18 @@ def text(runs):
 @pytest.fixture(scope="module")
 def page(text):
     return Page(text)
+
+
+def test_what_a_run_went_on_under_is_said(tmp_path):
+    run = write_run(tmp_path / "run")
+    path = run / "config.json"
+    changed = {"jax": "1.3", "git_revision": "fedcba9876543210-dirty", "cpus": 8}
+    path.write_text(
+        json.dumps(json.loads(path.read_text()) | {"continued": [{"env_steps": 100, "changed": changed}]})
+    )
+    about = configs.about(collect.load_run(run))
+    assert dict(about.versions) == {"jax": "1.2.3, then 1.3"} and about.cpus == "none, then 8"
+    assert overview._short(about) == "0123456789, then fedcba9876-dirty"
 
 
 def test_nothing_is_asked_for_from_outside(page):

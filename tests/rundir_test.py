@@ -1,5 +1,7 @@
 """srl_jax/rundir.py: one writer at a time, whatever becomes of it."""
 
+import errno
+import fcntl
 import json
 import os
 import re
@@ -121,6 +123,23 @@ def test_a_full_disk_does_not_keep_a_run_from_its_directory(tmp_path, monkeypatc
         with pytest.raises(ConfigError, match="is writing there"):
             rundir.check_free(tmp_path)
     assert contents(tmp_path) == {}
+
+
+@pytest.mark.parametrize("error", [errno.ENOSYS, errno.ENOLCK, errno.EOPNOTSUPP, errno.EBADF, errno.EINVAL])
+def test_a_file_system_without_locks_is_written_to_all_the_same(tmp_path, monkeypatch, capsys, error):
+    def flock(*_):
+        raise OSError(error, os.strerror(error))
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    rundir._say_without.cache_clear()
+    for _ in range(2):
+        rundir.check_free(tmp_path)
+        with rundir.held(tmp_path):
+            assert json.loads((tmp_path / "lock").read_text())["pid"] == os.getpid()
+            rundir.check_free(tmp_path)
+        assert contents(tmp_path) == {}
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and f"not locked ({os.strerror(error)})" in said
 
 
 @pytest.mark.parametrize("call", [1, 2, 3])

@@ -47,7 +47,7 @@ def make_run(config, path, **options):
     """A run whose agent is compiled once for all runs of a mode."""
     path.mkdir(exist_ok=True)
     no_matter = {"steps": 1, "stop_at_return": None, "checkpoint_every": 0, "keep_encoder_every": 0}
-    no_matter |= {"diagnostics": False, "diagnostics_kept": 0}
+    no_matter |= {"diagnostics": False, "diagnostics_kept": 0, "encoder_from": ""}
     return loop.Run(config, path, False, agent_of(dataclasses.replace(config, **no_matter)), **options)
 
 
@@ -164,6 +164,17 @@ def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(whole, tmp_path, 
     _, end = resume(config, tmp_path / "run")
     assert end == whole_end
     assert rows(tmp_path / "run") == rows(whole_path)
+
+
+def test_a_run_goes_on_without_the_encoder_that_it_started_from(whole, tmp_path):
+    shutil.copytree(whole("joint")[1], tmp_path / "source")
+    config = make_config("joint", encoder_from=str(tmp_path / "source"))
+    _, whole_end = go(config, tmp_path / "whole")
+    go(config, tmp_path / "run", 64)
+    shutil.rmtree(tmp_path / "source")
+    _, end = resume(config, tmp_path / "run")
+    assert end == whole_end
+    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("stop", [120, 124])

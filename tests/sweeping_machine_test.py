@@ -1,5 +1,7 @@
 """experiments/sweeping/machine.py and local.py: how many runs there is room for, and which cores they get."""
 
+import errno
+import fcntl
 import os
 import sys
 from collections import Counter
@@ -50,6 +52,17 @@ def test_cores_are_lent_to_one_run_each(tmp_path, monkeypatch):
     assert len(machine.lend(9, tmp_path).numbers) == 3
     for x in lent:
         x.give_back()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="affinity is Linux'")
+def test_runs_of_a_sweep_have_a_core_each_where_files_cannot_be_locked(tmp_path, monkeypatch):
+    def flock(*_):
+        raise OSError(errno.ENOSYS, "Function not implemented")
+
+    monkeypatch.setattr(fcntl, "flock", flock)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 5, 7})
+    monkeypatch.setattr(machine, "_lent", Counter())
+    assert sorted(machine.lend(1, tmp_path).numbers[0] for _ in range(3)) == [2, 5, 7]
 
 
 def test_a_gpu_has_one_run_and_all_cores(tmp_path, monkeypatch):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 from experiments import collect
 from experiments.collect import RunData
 from srl_jax import specs
-from srl_jax.config import INFOS, Config
+from srl_jax.config import INFOS, Config, history
 from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
@@ -16,9 +16,15 @@ from srl_jax.reading import SETTINGS, parse_json, read_bytes
 SPECIFICATIONS = ("rl", "encoder", "objectives")
 """Fields that are name:key=value,..., shown option by option."""
 
+THEN = ", then "
+"""Between what a run was made by and what it went on under."""
+
 
 class About(NamedTuple):
-    """What config.json says of where a run was made; empty where it does not."""
+    """What config.json says of where a run was made; empty where it does not.
+
+    Of a run that went on under other versions or elsewhere, each is there in turn: `1.2, then 1.3`.
+    """
 
     revision: str
     started: str
@@ -49,14 +55,17 @@ def about(run: RunData) -> About:
     path = run.path / "config.json"
     try:
         values = parse_json(read_bytes(path, SETTINGS))
-        versions = values.get("versions") or {}
-        pairs = tuple((str(name), str(version)) for name, version in versions.items())
+        past = {name: said for name, found in history(values).items() if (said := _in_turn(found))}
+        pairs = tuple((str(name), past.get(name, "")) for name in values.get("versions") or {})
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    except (ValueError, AttributeError) as error:
+    except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ConfigError(f"{path}: {error}") from None
-    revision, started, cpus = (str(values.get(name) or "") for name in ("git_revision", "started", "cpus"))
-    return About(revision, started, cpus, pairs)
+    return About(past.get("git_revision", ""), str(values.get("started") or ""), past.get("cpus", ""), pairs)
+
+
+def _in_turn(found: Sequence[Any]) -> str:
+    return THEN.join(str(value or "none") for value in found) if any(found) else ""
 
 
 def settings(runs: Sequence[RunData], arms: Sequence[str]) -> tuple[list[Differences], list[tuple[str, str]]]:

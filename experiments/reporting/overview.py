@@ -69,8 +69,9 @@ def what_was_run(report: Report) -> Content:
 
 
 def _short(about: About) -> str:
-    name, _, dirty = about.revision.partition("-")
-    return name[:10] + ("-dirty" if dirty else "") or "not recorded"
+    parts = [revision.partition("-") for revision in about.revision.split(configs.THEN)]
+    short = [name[:10] + ("-dirty" if dirty else "") for name, _, dirty in parts]
+    return configs.THEN.join(short) or "not recorded"
 
 
 def _seeds(report: Report) -> str:

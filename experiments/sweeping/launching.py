@@ -4,14 +4,12 @@ Where runs are executed is a `Launcher`'s: processes of this machine (`local`), 
 (`ray_launcher`).
 """
 
-import contextlib
-import signal
-import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
+from experiments.stopping import signals
 from experiments.sweeping import attempt, states
 from experiments.sweeping.manifest import Entry
 from srl_jax.config import Config
@@ -109,24 +107,6 @@ class Screen(Protocol):
 
     def note(self, text: str) -> None:
         """Shows a line of its own."""
-
-
-@contextlib.contextmanager
-def signals() -> Iterator[list[int]]:
-    """A list that gets the signals which come: Ctrl-C and SIGTERM."""
-    caught: list[int] = []
-    if threading.current_thread() is not threading.main_thread():  # which has them
-        yield caught
-        return
-    old = {
-        number: signal.signal(number, lambda number, frame: caught.append(number))
-        for number in (signal.SIGINT, signal.SIGTERM)
-    }
-    try:
-        yield caught
-    finally:
-        for number, handler in old.items():
-            signal.signal(number, handler)
 
 
 def launch(

@@ -15,7 +15,7 @@ from experiments import directories
 from experiments.sweeping import manifest as manifests
 from srl_jax import checkpoint, rundir
 from srl_jax.checkpoint import NUMBERS, PARAMS
-from srl_jax.config import Config, difference
+from srl_jax.config import Config, another_run, difference
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import Mark
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
@@ -79,14 +79,14 @@ def look(path: Path, config: Config) -> State:
     except ConfigError as error:
         return State("busy", reason=_without_flag(error))
     if blank:
-        return State("missing")
+        return State("resumable" if (path / "config.json").exists() else "missing")
     if problem:
         return State("broken", reason=problem)
     try:
         found = checkpoint.read_manifest(path)
     except ConfigError:
         return State("resumable")  # from an older one, or not begun: `prepare` finds out
-    if NUMBERS in found.files or difference(found.config, config):
+    if NUMBERS in found.files or another_run(found.config, config):
         return State("resumable", found.env_steps)
     if (problem := _incomplete(path, found)) is not None:
         return State("broken", found.env_steps, problem)
@@ -166,7 +166,7 @@ def _broken(path: Path, config: Config) -> str:
             if (steps := directories.reached(path)) >= directories.first_checkpoint(config):
                 return f"got to {steps} env steps, and there is no checkpoint"
             return ""
-        if differing := difference(found.config, config):
+        if differing := another_run(found.config, config):
             return f"{found.path.name} is of another configuration: {differing}"
         mark = Mark(**checkpoint.load_numbers(found)["report"]["metrics"])
         if (path / "metrics.jsonl").stat().st_size < mark.bytes:

@@ -13,6 +13,7 @@ from experiments.sweeping.launching import View
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.speed import Progress, Speeds, progress, seconds_left
 from srl_jax import checkpoint, ending, rundir
+from srl_jax.display import Display
 from srl_jax.errors import ConfigError
 from srl_jax.progress import hms
 
@@ -123,9 +124,9 @@ class Screen:
         clock: Callable[[], float] = time.monotonic,
     ):
         self.root, self.entries, self.workers = root, entries, workers
-        self.stream = sys.stderr if stream is None else stream
+        self.stream = Display(sys.stderr if stream is None else stream)
         self.clock = clock
-        self.tty = bool(getattr(self.stream, "isatty", lambda: False)())
+        self.tty = self.stream.isatty()
         self.drawn_at = self.measured_at = float("-inf")
         self.drawn = 0  # lines of the table that stand on the terminal
         self.seen: View | None = None
@@ -175,9 +176,8 @@ class Screen:
             self.drawn = 0
 
     def _write(self, text: str) -> None:
-        with contextlib.suppress(OSError):  # nobody reads it any more; the runs go on
-            self.stream.write(text)
-            self.stream.flush()
+        self.stream.write(text)
+        self.stream.flush()
 
     def _tell_changes(self, view: View) -> None:
         before = self.seen

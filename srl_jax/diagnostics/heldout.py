@@ -92,6 +92,8 @@ def _collect(protocol: Protocol, horizon: int, number: int) -> HeldOut:
     wanted = np.arange(0, steps, STRIDE) + rng.integers(0, STRIDE, (ENVS, steps // STRIDE))
     actions = rng.integers(0, env.single_action_space.n, (steps + STRIDE, ENVS), dtype=np.int32)
     order = rng.permutation(number)
+    # Drawn last: the observations of a game are the same however far its windows reach.
+    actions = np.concatenate([actions, rng.integers(0, env.single_action_space.n, (horizon, ENVS), np.int32)])
 
     replay = Replay(
         # As many slots as observations: every episode has one more of them than it has steps.

@@ -3,9 +3,9 @@
 Importing this package imports none of gymnasium, ale_py or jax; `make` does.
 """
 
-from srl_jax.envs.games import ATARI_57, CATCH, GAMES
+from srl_jax.envs.games import ATARI_57, CATCH, FRAME_SKIP, GAMES, MAX_FRAMES
 
-__all__ = ["ATARI_57", "CATCH", "GAMES", "make"]
+__all__ = ["ATARI_57", "CATCH", "FRAME_SKIP", "GAMES", "MAX_FRAMES", "make"]
 
 
 def make(
@@ -17,7 +17,7 @@ def make(
     sticky_actions: float = 0.0,
     noop_max: int = 30,
     full_action_space: bool = False,
-    max_frames: int = 108_000,
+    max_frames: int = MAX_FRAMES,
     reseed_every: int = 5_000,
     num_threads: int = 0,
 ):

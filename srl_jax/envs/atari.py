@@ -9,15 +9,13 @@ import numpy as np
 from gymnasium.vector import AutoresetMode
 
 from srl_jax.envs.base import Form, FrameVectorEnv
-from srl_jax.envs.games import rom_name
+from srl_jax.envs.games import FRAME_SKIP, MAX_FRAMES, rom_name
 
 try:
     from ale_py.vector_env import AtariVectorEnv
 except ImportError as error:
     raise ImportError("Atari games need ale-py: pip install srl-jax[atari]") from error
 
-FRAME_SKIP = 4
-"""Emulator frames per env step."""
 COUNTERS = ("lives", "frame_number", "episode_frame_number")
 """What ALE says of an environment beside its frame, int32 each."""
 RESET = 255
@@ -64,7 +62,7 @@ class Atari(FrameVectorEnv):
         sticky_actions: float = 0.0,
         noop_max: int = 30,
         full_action_space: bool = False,
-        max_frames: int = 108_000,
+        max_frames: int = MAX_FRAMES,
         reseed_every: int = 5_000,
         num_threads: int = 0,
     ):

@@ -1,6 +1,11 @@
-"""The names of the games. Imports nothing heavy, so that a command line can be checked at once."""
+"""The names of the games, and their time. Imports nothing heavy: a command line can be checked at once."""
 
 import re
+
+FRAME_SKIP = 4
+"""Emulator frames per env step."""
+MAX_FRAMES = 108_000
+"""Emulator frames after which an episode is truncated, unless told otherwise: half an hour of play."""
 
 ATARI_57 = tuple(
     """

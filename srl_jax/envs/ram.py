@@ -8,8 +8,7 @@ import ale_py
 import numpy as np
 from ale_py import roms
 
-from srl_jax.envs.atari import FRAME_SKIP
-from srl_jax.envs.games import rom_name
+from srl_jax.envs.games import FRAME_SKIP, rom_name
 
 TOLERANCE = 1.0
 """Grey levels by which a frame may differ from the screen that is made smaller here: both are rounded."""
