@@ -10,6 +10,7 @@ import threading
 import time
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
@@ -17,6 +18,7 @@ from srl_jax import checkpoint, ending, loop
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.modes import ENCODER_OPTIMIZERS
 from srl_jax.update import Hyper
 from tests.helpers import JOINT, SMALL, identical
 
@@ -462,7 +464,7 @@ def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
     loop.train(config, path, progress=False, resume=manifest)
     assert ending.read(path) == ("finished", 240, "")
     # So does one that ends before its first step.
-    monkeypatch.setattr(loop, "make_env", lambda *arguments: 1 / 0)
+    monkeypatch.setattr(loop, "make_env", lambda *arguments, **options: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         train(tmp_path / "other")
     assert ending.read(tmp_path / "other") == ("failed", 0, "ZeroDivisionError: division by zero")
@@ -512,3 +514,48 @@ def test_learning_rates_fall_linearly_to_the_share_that_is_left():
     assert at(200, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 0.8e-3})
     assert at(150, lr_final=0.2).weights == hyper.weights
     assert all(rate.dtype == np.float32 for rate in at(150, lr_final=0.2).learning_rates.values())
+
+
+def started(tmp_path, **values):
+    """The parameters that a run begins with."""
+    run = loop.Run(Config(**{**SMALL, **values}), tmp_path, progress=False)
+    run.env.close()
+    run.env_thread.shutdown()
+    return run.state.params
+
+
+def test_heads_that_both_runs_have_start_from_the_other_run_as_asked(joint, tmp_path):
+    source, _ = joint
+    theirs = checkpoint.load(whole(source))
+    objectives = ("reconstruction", "inverse")
+    scratch = started(tmp_path, mode="joint", objectives=objectives, seed=9)
+    for heads_from, taken in (
+        ("representation", {"encoder", "reconstruction"}),
+        ("all", {"encoder", "reconstruction", "rl"}),
+        ("none", {"encoder"}),
+    ):
+        how = {"encoder_from": str(source), "heads_from": heads_from}
+        params = started(tmp_path, mode="joint", objectives=objectives, seed=9, **how)
+        for name in ("encoder", "rl", *objectives):
+            assert identical(params[name], theirs[name] if name in taken else scratch[name]), name
+
+
+def test_a_head_that_does_not_fit_is_named_with_a_way_out(joint, tmp_path):
+    source, _ = joint
+    other = {"rl": "rainbow:hidden=8,atoms=11,v_min=-2,v_max=2", "mode": "finetuned"}
+    with pytest.raises(
+        ConfigError, match="--heads_from=none starts from the encoder alone.*.rl..*not float32"
+    ):
+        started(tmp_path, encoder_from=str(source), heads_from="all", **other)
+    started(tmp_path, encoder_from=str(source), **other)
+
+
+@pytest.mark.parametrize("form", ENCODER_OPTIMIZERS)
+def test_a_run_makes_no_nan_on_the_way(form, tmp_path):
+    # jax.debug_nans takes any NaN for a fault, a placeholder too.
+    with jax.debug_nans(True):
+        train(tmp_path / form, **JOINT, encoder_optimizer=form, max_grad_norm=1.0, steps=160)
+    rows = read_metrics(tmp_path / form / "metrics.jsonl")
+    assert any(row.get("grad_norm/encoder", 0) > 0 for row in rows)  # measured in some updates alone
+    ratios = [row["step_ratio/encoder"] for row in rows if "step_ratio/encoder" in row]
+    assert bool(ratios) == (form != "summed") and all(0.05 < ratio < 20 for ratio in ratios)

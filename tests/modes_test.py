@@ -6,10 +6,12 @@ import jax
 import numpy as np
 import pytest
 
+from srl_jax import encoders, objectives, rl
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.modes import MODES
-from srl_jax.optim import RL
+from srl_jax.optim import RL, make_optimizer
+from srl_jax.update import make_init, make_update, periodic
 from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_window, random_state
 
 TERMS = ("reconstruction", "inverse")
@@ -186,3 +188,35 @@ def test_an_update_of_rl_alone_takes_over_and_returns_only_what_it_moves():
     assert identical(state.params, before)
     assert all_moved(before["encoder"], new.params["encoder"])
     assert int(new.step) == 1
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_everything_is_float32_also_where_jax_may_use_64_bits(mode):
+    # Shapes and dtypes alone: nothing is compiled.
+    terms = tuple(objectives.REGISTRY) if MODES[mode].representation else ()
+    pairs = [(name, "rainbow") for name in encoders.REGISTRY] + [("tiny", name) for name in rl.REGISTRY]
+    for encoder, name in pairs:
+        with jax.enable_x64(True):
+            values = {"encoder": encoder, "rl": name, "mode": mode, "max_grad_norm": 1.0}
+            agent = make_agent(Config(objectives=terms, **values), NUM_ACTIONS)
+            state = jax.eval_shape(agent.init.__wrapped__, jax.random.key(0))
+            window = make_window(horizon=agent.horizon, size=84)
+            after = jax.eval_shape(agent.update.pure, state, window, agent.hyper)
+        for leaf in jax.tree.leaves((state, *after)):
+            assert leaf.dtype not in (np.float64, np.int64), (encoder, name)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_slow_copies_follow_their_objective_in_every_mode(mode):
+    # An objective with a rule has a slow copy of the encoder and of its head, which the rule moves.
+    rules = {RL: periodic(2), "reconstruction": lambda new, old, step: new}
+    agent, _, _ = build(mode)
+    terms = {n: o._replace(slow=rules.get(n)) for n, o in agent.objectives.items()}
+    optimizer = make_optimizer(terms)
+    state = random_state(make_init(agent.encoder, terms, MODES[mode], optimizer))
+    assert set(state.slow) == set(rules) & set(terms)
+    update = make_update(agent.encoder, terms, MODES[mode], optimizer)
+    after = jit(update)(state, WINDOW, agent.hyper)[0]
+    for name, slow in after.slow.items():
+        now = {"encoder": after.params["encoder"], "head": after.params[name]}
+        assert identical(slow, now if name != RL else state.slow[name])

@@ -83,11 +83,23 @@ def _slower_part(reply: dict[str, Any]) -> list[float]:
     return [1e3 * max(float(np.median(reply[name])) for name in ("acting", "update"))]
 
 
-ARMS = {"nature": "rl_only_nature", "256": "rl_only_256", "joint": "joint_256"}
-"""{short name: arm of the thesis} of the updates that are compared."""
+ARMS = {
+    "nature": ("rl_only_nature", "separate"),
+    "256": ("rl_only_256", "separate"),
+    "joint": ("joint_256", "separate"),
+    "summed": ("joint_256", "summed"),
+}
+"""{short name: (arm of the thesis, how its encoder is stepped)} of the updates that are compared."""
 
-_UPDATES = {"nature": 60, "256": 24, "joint": 12, "joint4": 16}  # timed in a round
-_SECONDS = {"nature": (10, 1.5), "256": (20, 2), "joint": (35, 3), "joint4": (35, 2)}
+_UPDATES = {
+    "nature": 60,
+    "256": 24,
+    "joint": 12,
+    "summed": 12,
+    "simultaneous": 12,
+    "joint4": 16,
+}  # in a round
+_SECONDS = {"nature": (10, 1.5), "256": (20, 2), "joint": (35, 4), "summed": (35, 3)}
 FORMATS = ("contiguous", "channels_last")
 CHECK_UPDATES = 2
 """Updates whose losses must be equal; the second one's depend on the first one's gradients."""
@@ -100,15 +112,15 @@ def _ours(group: str, short: str, arm: str, **overrides: Any) -> Side:
         ("nature" if arm.endswith("nature") else "sac_ae",),
         {"do": "setup", "preset": f"thesis/{arm}", **overrides},
         ({"do": "time", "updates": 8},),
-        seconds=_SECONDS[short],
+        seconds=_SECONDS.get(short, _SECONDS["joint"]),
     )
 
 
-def _torch(group: str, short: str, arm: str, memory_format: str) -> Side:
+def _torch(group: str, short: str, arm: str, form: str, memory_format: str) -> Side:
     return Side(
         group,
         "torch_side",
-        setup={"do": "setup", "arm": arm, "memory_format": memory_format},
+        setup={"do": "setup", "arm": arm, "memory_format": memory_format, "encoder_optimizer": form},
         warm=({"do": "time", "updates": 5},),
         needs="torch",
         twin=f"jax {short}",
@@ -118,11 +130,12 @@ def _torch(group: str, short: str, arm: str, memory_format: str) -> Side:
 
 SIDES: dict[str, Side] = {}
 SERIES: dict[str, Series] = {}
-for _short, _arm in ARMS.items():
+for _short, (_arm, _form) in ARMS.items():
     _group = "nature" if _short == "nature" else "256"
-    SIDES[f"jax {_short}"] = _ours(_group, _short, _arm)
+    SIDES[f"jax {_short}"] = _ours(_group, _short, _arm, encoder_optimizer=_form)
     for _format in FORMATS:
-        SIDES[f"torch {_short} {_format}"] = _torch(_group, _short, _arm, _format)
+        SIDES[f"torch {_short} {_format}"] = _torch(_group, _short, _arm, _form, _format)
+SIDES["jax simultaneous"] = _ours("256", "simultaneous", "joint_256", encoder_optimizer="simultaneous")
 SIDES["jax joint4"] = _ours("256", "joint4", "joint_256", srl_every=4)
 for _name in SIDES:
     _request = {"do": "time", "updates": _UPDATES[_name.split()[1]]}
@@ -173,7 +186,18 @@ def _at_most(limit: float) -> tuple[Goal, ...]:
 ROWS: dict[str, Row] = {
     "update_nature": _update("nature", "rl_only nature", 1.8),
     "update_256": _update("256", "rl_only 256", 1.25),
-    "update_joint": _update("joint", "joint 256", 1.3),
+    "update_joint": _update("joint", "joint 256, two Adams in turn", 1.3),
+    "update_summed": _update("summed", "joint 256, one Adam", 1.3),
+    "separate_cost": Row(
+        "two Adams in turn / one Adam, joint 256",
+        "ms",
+        "jax joint",
+        {"one Adam": "jax summed"},
+        _at_most(1.35),
+    ),
+    "simultaneous_cost": Row(
+        "two Adams at once / one Adam", "ms", "jax simultaneous", {"one Adam": "jax summed"}, ()
+    ),
     "loop": Row(
         "loop Pong nature", "env steps/s", "loop", {"Tianshou": "tianshou"}, (Goal("ratio", ">=", 2.5),)
     ),
@@ -182,9 +206,11 @@ ROWS: dict[str, Row] = {
     ),
     "busy": Row("cores that the loop keeps busy", "cores", "busy", {}, ()),
     "joint_cost": Row(
-        "joint / rl_only, updates of 256", "ms", "jax joint", {"rl_only": "jax 256"}, _at_most(1.7)
+        "joint, one Adam / rl_only, updates of 256", "ms", "jax summed", {"rl_only": "jax 256"}, _at_most(1.7)
     ),
-    "joint_cost_4": Row("the same, srl_every=4", "ms", "jax joint4", {"rl_only": "jax 256"}, _at_most(1.2)),
+    "joint_cost_4": Row(
+        "two Adams and srl_every=4 / rl_only", "ms", "jax joint4", {"rl_only": "jax 256"}, _at_most(1.2)
+    ),
     "replay_sample": Row(
         "replay sample + set priorities",
         "ms",

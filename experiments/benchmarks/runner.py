@@ -164,7 +164,8 @@ def _set_up(
         results.versions[name] = reply.get("versions", {})
     if twin is not None:
         found = difference(twin["losses"], worker.ask("check", updates=CHECK_UPDATES)["losses"])
-        arm = ARMS[name.split()[1]]
+        arm, form = ARMS[name.split()[1]]
+        arm += "" if form == "separate" else f" {form}"
         if not found <= TOLERANCE:
             raise CheckFailed(
                 f"{name}: a loss differs by {found:.1e} of its value, more than {TOLERANCE:.0e}"

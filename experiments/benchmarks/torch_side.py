@@ -20,10 +20,10 @@ from torch.nn import functional as F
 
 from experiments.benchmarks.worker import serve
 
-INPUT_GAIN = 32.0  # srl_jax.encoders.convolutional.INPUT_GAIN
+INPUT_GAIN = 32.0  # the presets' option gain
 N_STEP = 3
 ATOMS, V_MIN, V_MAX = 51, -10.0, 10.0
-INIT_STD = 1.0  # of the value distribution at the start, in units of reward
+INIT_STD = 1.0  # the presets' option: of the value distribution at the start, in units of reward
 HIDDEN = 512
 LEARNING_RATE, ADAM_EPS = 1e-4, 1e-8
 DECODER_WEIGHT_DECAY = 1e-7
@@ -182,6 +182,7 @@ class Learner:
         window: dict[str, np.ndarray],
         num_actions: int,
         memory_format: torch.memory_format,
+        encoder_optimizer: str,
     ):
         """Builds everything.
 
@@ -191,6 +192,8 @@ class Learner:
             window: srl_jax's `Window`, frames uint8 [B, S + K, H, W] and the rest: one batch for all updates.
             num_actions: A.
             memory_format: of images and kernels.
+            encoder_optimizer: "summed": one Adam on the sum of the losses; "separate": RL's Adam steps, then
+                the representation's own on the same batch, encoded anew, as the thesis' code does.
 
         Raises:
             ValueError: parameters that do not fit the arm.
@@ -205,20 +208,26 @@ class Learner:
         self.slow = Network(ARMS[arm], channels, sizes, num_actions).requires_grad_(False)
         self.decoder = None
         left = dict(params)
-        _load(self.online, left, "params")
-        _load(self.slow, left, "slow")
+        _load(self.online, left, "params/encoder", "params/rl")
+        _load(self.slow, left, "slow/rl/encoder", "slow/rl/head")
         groups: list[dict[str, Any]] = [{"params": list(self.online.parameters())}]
+        second: list[dict[str, Any]] = []
         if ARMS[arm].joint:
             self.decoder = Decoder(ARMS[arm], channels, sizes, self.online.encoder.maps)
             _load_decoder(self.decoder, left)
             self.decoder.to(memory_format=memory_format)
-            groups.append({"params": list(self.decoder.parameters()), "weight_decay": DECODER_WEIGHT_DECAY})
+            decoder = {"params": list(self.decoder.parameters()), "weight_decay": DECODER_WEIGHT_DECAY}
+            if encoder_optimizer == "separate":
+                second = [{"params": list(self.online.encoder.parameters())}, decoder]
+            else:
+                groups.append(decoder)
         if left:
             raise ValueError(f"{arm} has no {', '.join(sorted(left))}")
         self.online.to(memory_format=memory_format)
         self.slow.to(memory_format=memory_format)
-        self.parameters = [p for group in groups for p in group["params"]]
+        self.parameters = list({p for group in groups + second for p in group["params"]})
         self.optimizer = torch.optim.Adam(groups, lr=LEARNING_RATE, eps=ADAM_EPS)
+        self.second = torch.optim.Adam(second, lr=LEARNING_RATE, eps=ADAM_EPS) if second else None
         self.support = _support()
         self.steps = 0
 
@@ -228,7 +237,7 @@ class Learner:
         self.slow.train(on)
 
     def update(self) -> tuple[np.ndarray, dict[str, Tensor]]:
-        """One gradient step on the batch.
+        """One update on the batch: a gradient step, or two.
 
         Returns:
             The temporal-difference errors, float32 [B], in nats: the Kullback-Leibler divergence of the value
@@ -252,14 +261,16 @@ class Learner:
         cross_entropy = -(target * logits_tm1[rows, batch["actions"][:, 0]].log_softmax(-1)).sum(-1)
 
         losses = {"rl": (cross_entropy * batch["weight"]).mean()}
-        if self.decoder is not None:
-            losses["reconstruction"] = F.mse_loss(self.decoder(z_tm1), pixels_tm1)
-            losses["latent_l2"] = 0.5 * z_tm1.square().sum(-1).mean()
-        total = sum(WEIGHTS[name] * loss for name, loss in losses.items())
-
-        self.optimizer.zero_grad()
-        total.backward()
-        self.optimizer.step()
+        if self.second is not None:
+            self._step(self.optimizer, losses)
+            later = self._representation(self.online.encoder(pixels_tm1), pixels_tm1)
+            self._step(self.second, later)
+            losses |= later
+        else:
+            if self.decoder is not None:
+                losses |= self._representation(z_tm1, pixels_tm1)
+            self._step(self.optimizer, losses)
+        total = sum(WEIGHTS[name] * loss.detach() for name, loss in losses.items())
         self.steps += 1
         if self.steps % SLOW_UPDATE_EVERY == 0:
             self.slow.load_state_dict(self.online.state_dict())
@@ -269,7 +280,18 @@ class Learner:
             td_error = (cross_entropy - entropy).clamp(min=0).numpy()
             q_max = (logits_tm1.softmax(-1) @ self.support).amax(-1).mean()
         metrics = {name: loss.detach() for name, loss in losses.items()}
-        return td_error, metrics | {"total": total.detach(), "q_max": q_max}
+        return td_error, metrics | {"total": total, "q_max": q_max}
+
+    def _representation(self, z: Tensor, pixels: Tensor) -> dict[str, Tensor]:
+        return {
+            "reconstruction": F.mse_loss(self.decoder(z), pixels),
+            "latent_l2": 0.5 * z.square().sum(-1).mean(),
+        }
+
+    def _step(self, optimizer: torch.optim.Optimizer, losses: dict[str, Tensor]) -> None:
+        optimizer.zero_grad()
+        sum(WEIGHTS[name] * loss for name, loss in losses.items()).backward()
+        optimizer.step()
 
     def _pixels(self, frames: Tensor) -> Tensor:
         return frames.to(torch.float32, memory_format=self.memory_format) / 255
@@ -307,21 +329,21 @@ def _support() -> Tensor:
     return torch.linspace(V_MIN, V_MAX, ATOMS)
 
 
-def _load(network: Network, params: dict[str, np.ndarray], prefix: str) -> None:
-    """Copies an encoder and its RL head, and takes what it copied out of params."""
+def _load(network: Network, params: dict[str, np.ndarray], prefix: str, head: str) -> None:
+    """Copies an encoder and its RL head, of these paths, and takes what it copied out of params."""
     encoder, maps = network.encoder, network.encoder.maps
     for i, conv in enumerate(encoder.convs):
-        _load_conv(conv, params, f"{prefix}/encoder/Conv_{i}", (3, 2, 0, 1))
+        _load_conv(conv, params, f"{prefix}/Conv_{i}", (3, 2, 0, 1))
     if encoder.bottleneck is not None:
         linear, norm, _ = encoder.bottleneck
-        name = f"{prefix}/encoder/Dense_0"
+        name = f"{prefix}/Dense_0"
         _set(linear.weight, _rows_chw(params.pop(f"{name}/kernel"), maps).T)
         _set(linear.bias, params.pop(f"{name}/bias"))
-        name = f"{prefix}/encoder/LayerNorm_0"
+        name = f"{prefix}/LayerNorm_0"
         _set(norm.weight, params.pop(f"{name}/scale"))
         _set(norm.bias, params.pop(f"{name}/bias"))
     for layer in ("q_hidden", "q_out", "v_hidden", "v_out"):
-        noisy, name = getattr(network.head, layer), f"{prefix}/heads/rl/{layer}"
+        noisy, name = getattr(network.head, layer), f"{head}/{layer}"
         for ours, theirs in (("mu", ""), ("sigma", "_sigma")):
             kernel = params.pop(f"{name}/kernel{theirs}")
             if layer.endswith("hidden") and encoder.bottleneck is None:
@@ -332,7 +354,7 @@ def _load(network: Network, params: dict[str, np.ndarray], prefix: str) -> None:
 
 def _load_decoder(decoder: Decoder, params: dict[str, np.ndarray]) -> None:
     """As `_load`, a decoder."""
-    name = "params/heads/reconstruction"
+    name = "params/reconstruction"
     _set(decoder.linear.weight, _rows_chw(params.pop(f"{name}/WideDense_0/kernel"), decoder.maps))
     _set(decoder.linear.bias, _rows_chw(params.pop(f"{name}/WideDense_0/bias"), decoder.maps))
     for i, conv in enumerate(decoder.convs):
@@ -374,6 +396,7 @@ class Side:
         threads: int = 2,
         memory_format: str = "contiguous",
         num_actions: int = 6,
+        encoder_optimizer: str = "separate",
     ) -> dict[str, Any]:
         """Builds an arm's learner.
 
@@ -384,6 +407,7 @@ class Side:
             threads: PyTorch's.
             memory_format: "contiguous" or "channels_last".
             num_actions: A.
+            encoder_optimizer: see `Learner`.
 
         Returns:
             "versions" of PyTorch and Python; "parameters", how many numbers are trained.
@@ -391,7 +415,9 @@ class Side:
         formats = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
         torch.set_num_threads(threads)
         torch.manual_seed(0)
-        self._arguments = (arm, _read(params), _read(window), num_actions, formats[memory_format])
+        self._arguments = (
+            arm, _read(params), _read(window), num_actions, formats[memory_format], encoder_optimizer,
+        )  # fmt: skip
         self._learner = Learner(*self._arguments)
         versions = {"torch": torch.__version__, "python": platform.python_version()}
         return {"versions": versions, "parameters": sum(p.numel() for p in self._learner.parameters)}

@@ -18,7 +18,7 @@ def forward_pixels(context: Context, *, weight: float = 1.0) -> Objective:
     decoder = context.encoder.make_decoder(context.num_actions)
 
     def picture(head, latents: Latents, window: Window):
-        action = jax.nn.one_hot(window.actions[:, 0], context.num_actions)
+        action = jax.nn.one_hot(window.actions[:, 0], context.num_actions, dtype=jnp.float32)
         inputs = jnp.concatenate([latents.online(0), action], -1)
         return image(window, 1), decoder.apply(head, inputs)
 
