@@ -298,7 +298,7 @@ def test_a_page_of_runs_of_before(tmp_path):
     write_run(tmp_path / "b/seed0", [-1.0], mode="joint")
     write_run(tmp_path / "pretrain/seed0", mode="pretrain")
     page = Page(build(tmp_path, media=False))
-    assert "These runs have no diagnostics" in page.text and "no_media" in page.text
+    assert "These runs have no diagnostics" in page.text and "--nomedia" in page.text
     assert list(page.table("Statistics of Catch")) == ["arm", "a", "random policy", "no-op policy"]
     assert "Catch / b / seed 0: 200 of 200 env steps" in page.text  # it lacks evaluations
     assert [a["alt"] for tag, a in page.attributes if tag == "img"] == ["Catch: learning curves"]

@@ -165,7 +165,7 @@ def panels(report: Report) -> Content:
 def _by_game(report: Report, cells: Callable[[RunData], list[Markup]], kind: str, note: str) -> Content:
     """A grid a game of what each arm's first seed has to show; None where none has anything."""
     if not report.media:
-        return tag("p", "Left out (--no_media).", class_="note")
+        return tag("p", "Left out (--nomedia).", class_="note")
     parts: list = []
     for game in report.games:
         if shown := [cell for run in _first_runs(report, game) for cell in cells(run)]:
