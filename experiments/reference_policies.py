@@ -25,7 +25,8 @@ import numpy as np
 from absl import flags
 
 from experiments import flags as config_flags
-from experiments.train import check_extras, stopping
+from experiments.stopping import signals
+from experiments.train import check_extras
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
 from srl_jax.envs import CATCH, GAMES
@@ -56,7 +57,7 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
 
     seed = functools.partial(seed_for, config.seed, "reference policy", policy)
     number = min(episodes, MOST_ENVS)
-    env = loop.make_env(config, number, seed("environments"))
+    env = loop.make_env(config, number, seed("environments"), max_steps=config.eval_max_steps)
     with contextlib.closing(env), Progress(episodes, "games") as progress:
         began = time.monotonic()
 
@@ -194,7 +195,7 @@ def run(values: flags.FlagValues) -> int:
         out = _check_out(out)
     writer = csv.writer(sys.stdout, lineterminator="\n")
     writer.writerow(ReferencePolicy._fields)
-    with stopping() as caught:
+    with signals() as caught:
         for config in configs:
             for policy in policies:
                 row = play(policy, config, episodes, stop=lambda: bool(caught))
