@@ -127,7 +127,7 @@ def test_rows_are_printed_and_put_into_a_file(tmp_path, capsys):
 
 def test_what_was_played_until_a_signal_is_kept(tmp_path, capsys, monkeypatch):
     caught = []
-    monkeypatch.setattr(played, "stopping", lambda: played.contextlib.nullcontext(caught))
+    monkeypatch.setattr(played, "signals", lambda: played.contextlib.nullcontext(caught))
     update = played.update
     monkeypatch.setattr(played, "update", lambda *row: caught.append(15) or update(*row))
     path = tmp_path / "mine.csv"
