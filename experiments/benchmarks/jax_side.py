@@ -4,6 +4,7 @@
 itself. Imports jax when it is first asked.
 """
 
+import dataclasses
 import sys
 import time
 from pathlib import Path
@@ -23,6 +24,9 @@ NUM_ACTIONS = 6
 
 WINDOWS = 8
 """Different batches that the timed updates take in turn."""
+
+CHECK_ADAM_EPS = 1e-3
+"""Of the checked updates: with a tiny one, Adam's first step is the sign of a gradient, rounding and all."""
 
 JITTER = 0.003
 """Standard deviation of noise on the checked weights, so that biases are not 0 and the slow copy is none."""
@@ -121,7 +125,7 @@ class Updates:
         np.savez(paths["params"], **weights)
         np.savez(paths["window"], **window._asdict())
         # Not the timed update: what is traced here has no noise in it.
-        agent = make_agent(self._config, NUM_ACTIONS)
+        agent = make_agent(dataclasses.replace(self._config, adam_eps=CHECK_ADAM_EPS), NUM_ACTIONS)
         losses = []
         with mock.patch.object(heads, "factorised_noise", lambda key, size: np.zeros(size, np.float32)):
             for _ in range(updates):

@@ -26,6 +26,7 @@ ATOMS, V_MIN, V_MAX = 51, -10.0, 10.0
 INIT_STD = 1.0  # the presets' option: of the value distribution at the start, in units of reward
 HIDDEN = 512
 LEARNING_RATE, ADAM_EPS = 1e-4, 1e-8
+CHECK_ADAM_EPS = 1e-3  # see srl_jax' side
 DECODER_WEIGHT_DECAY = 1e-7
 SLOW_UPDATE_EVERY = 500  # updates
 WEIGHTS = {"rl": 1.0, "reconstruction": 1.0, "latent_l2": 1e-6}
@@ -183,6 +184,7 @@ class Learner:
         num_actions: int,
         memory_format: torch.memory_format,
         encoder_optimizer: str,
+        adam_eps: float = ADAM_EPS,
     ):
         """Builds everything.
 
@@ -194,6 +196,7 @@ class Learner:
             memory_format: of images and kernels.
             encoder_optimizer: "summed": one Adam on the sum of the losses; "separate": RL's Adam steps, then
                 the representation's own on the same batch, encoded anew, as the thesis' code does.
+            adam_eps: Adam's epsilon.
 
         Raises:
             ValueError: parameters that do not fit the arm.
@@ -226,8 +229,8 @@ class Learner:
         self.online.to(memory_format=memory_format)
         self.slow.to(memory_format=memory_format)
         self.parameters = list({p for group in groups + second for p in group["params"]})
-        self.optimizer = torch.optim.Adam(groups, lr=LEARNING_RATE, eps=ADAM_EPS)
-        self.second = torch.optim.Adam(second, lr=LEARNING_RATE, eps=ADAM_EPS) if second else None
+        self.optimizer = torch.optim.Adam(groups, lr=LEARNING_RATE, eps=adam_eps)
+        self.second = torch.optim.Adam(second, lr=LEARNING_RATE, eps=adam_eps) if second else None
         self.support = _support()
         self.steps = 0
 
@@ -427,7 +430,7 @@ class Side:
 
         From the parameters that setup was given, on networks of its own.
         """
-        learner = Learner(*self._arguments)
+        learner = Learner(*self._arguments, CHECK_ADAM_EPS)
         learner.noise(False)
         return {"losses": [self._losses(learner) for _ in range(updates)]}
 
