@@ -95,7 +95,7 @@ class Objective(NamedTuple):
         init: key -> head parameters (may be an empty dict).
         loss: (head, slow_head, latents, window, key) -> (losses [B], metrics: dict of scalars, or of [B]
             arrays for `td_error`).
-        weight: the factor of its batch mean in the summed loss.
+        weight: the factor of its batch mean in the sum of a pass.
         horizon: how many steps after s_t it reads.
         slow: how its head's slow copy follows, (new, old, step) -> slow; None if it has none. A rule that
             changes nothing but in every k-th step may say so by an attribute `every` = k.

@@ -1,4 +1,4 @@
-"""make_init, make_update, make_conflict and make_act: the one place where losses are summed."""
+"""make_init, make_update, make_conflict and make_act: where losses are summed and the encoder is stepped."""
 
 import math
 import zlib
