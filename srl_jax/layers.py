@@ -118,7 +118,7 @@ class Conv(nn.Module):
     Attributes:
         features: output channels.
         kernel, stride: in pixels.
-        init: a key of `INITIALISERS`.
+        initial: a key of `INITIALISERS`.
         zero_sum: whether its kernels start with a sum of 0, see `zero_sum`.
         gain: factor of the input.
     """
@@ -126,13 +126,13 @@ class Conv(nn.Module):
     features: int
     kernel: int
     stride: int
-    init: str = "pytorch"
+    initial: str = "pytorch"
     zero_sum: bool = False
     gain: float = 1.0
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        init, bias_init = INITIALISERS[self.init](self.kernel**2 * x.shape[-1])
+        init, bias_init = INITIALISERS[self.initial](self.kernel**2 * x.shape[-1])
         if self.zero_sum:
             init = zero_sum(init)
         kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
@@ -153,7 +153,7 @@ class ConvTranspose(nn.Module):
         stride: the factor by which the image grows.
         size: side of the output, in pixels; at least `(h - 1) * stride + kernel`, and less than `stride`
             above it (what PyTorch calls output padding): what the mirrored layer saw.
-        init: a key of `INITIALISERS`.
+        initial: a key of `INITIALISERS`.
         init_scale: factor of the kernel's initial values.
     """
 
@@ -161,7 +161,7 @@ class ConvTranspose(nn.Module):
     kernel: int
     stride: int
     size: int
-    init: str = "pytorch"
+    initial: str = "pytorch"
     init_scale: float = 1.0
 
     @nn.compact
@@ -171,7 +171,7 @@ class ConvTranspose(nn.Module):
         if not 0 <= self.size - ((height - 1) * s + k) < s:
             raise ValueError(f"a kernel of {k} with stride {s} cannot make {self.size} pixels from {height}")
         fan_in = max(1, k // s) ** 2 * channels  # the inputs that reach an output pixel
-        init, bias_init = INITIALISERS[self.init](fan_in)
+        init, bias_init = INITIALISERS[self.initial](fan_in)
         kernel = self.param("kernel", scaled(init, self.init_scale), (k, k, channels, self.features))
         bias = self.param("bias", bias_init, (self.features,))
         taps = -(-k // s)

@@ -117,7 +117,7 @@ def test_flags_override_a_preset_even_where_they_give_the_default():
     assert config.augment == "none" == Config().augment
     assert config.objectives == ("reconstruction",)
     assert config.stop_at_return is None
-    assert config.encoder == "sac_ae:features=256"
+    assert config.encoder == PRESETS["thesis/joint_256_l2_aug"]["encoder"]
     assert _config(preset).stop_at_return == 20
     assert _config(preset, "--game=Breakout").stop_at_return is None
     assert _config(preset, "--mode=rl_only", "--objective=none").objectives == ()
@@ -127,7 +127,9 @@ def test_short_flags_stand_for_options_of_rl():
     assert _config("--n_step=5", "--num_atoms=21").rl == "rainbow:n_step=5,atoms=21"
     assert _config("--rl=dqn:double=true", "--alpha=1").rl == "dqn:double=true,alpha=1.0"
     assert _config("--rl=rainbow:v_min=-1", "--v_min=-1.0").rl == "rainbow:v_min=-1"
-    assert _config("--preset=demo", "--noisy_std=0.5").rl == "rainbow:noisy_std=0.5"
+    assert _config("--preset=catch/rl_only", "--noisy_std=0.5").rl == (
+        "rainbow:v_min=-2,v_max=2,noisy_std=0.5,hidden=128"
+    )
     # A preset's option is overridden like the rest of it; a typed one contradicts.
     assert config_flags.with_rl_options("c51:n_step=1", {"n_step": 3}, False) == "c51:n_step=3"
     with pytest.raises(ConfigError, match="--n_step=3: contradicts --rl=c51:n_step=1"):
@@ -173,7 +175,7 @@ BAD = [
     (["--tune_runtime=x"], "--tune_runtime=x", "valid: auto, off"),
     (["--steps"], "--steps", ""),
     (["--gane=Pong"], "--gane", "did you mean --game"),
-    (["--lr=1"], "--lr: no such flag", "did you mean --lr_encoder or --lr_final or --lr_rl or --lr_srl?"),
+    (["--lr=1"], "--lr: no such flag", "did you mean --lr_encoder or --lr_encoder_srl or"),
     (["Pong"], "'Pong'", "--name=value"),
     (["--notensorboard=1"], "--notensorboard=1", "argument"),
     (["--flagfile=/dev/zero"], "--flagfile", "write the flags themselves"),
@@ -216,7 +218,7 @@ def test_a_later_flag_of_a_name_replaces_an_earlier_one():
     [
         ("draw", "run", "give it once"),
         ("evaluate", "games", "give it once"),
-        ("report", "runs", "give it once"),
+        ("report", "out", "give it once"),
         ("sweep", "lr_rl", "give it once"),
         ("sweep", "presets", "separate values with commas"),
         ("figures", "games", "separate values with commas"),

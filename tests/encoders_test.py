@@ -82,20 +82,28 @@ def test_pixels_are_divided_by_255():
     np.testing.assert_allclose(from_bytes, from_unit, rtol=1e-6, atol=1e-6)
 
 
-def test_latents_start_blind_to_a_uniform_background_and_see_a_ball():
-    # Two grey fields, and on Pong's grey a ball of 2 x 4 pixels in 30 places. A uniform image gives 0 (biases
-    # start at 0); a ball moves latents by tenths, and switches units on that are off elsewhere.
+def test_latents_can_start_blind_to_a_uniform_background_and_see_a_ball():
+    # Two grey fields, and on Pong's grey a ball of 2 x 4 pixels in 30 places. With kernels that sum to 0 and
+    # He's biases of 0 a uniform image gives 0; a ball moves latents by tenths, and switches units on that are
+    # off elsewhere. Of the textbook's start none of it is true.
     rng = np.random.default_rng(0)
     frames = np.full((32, 84, 84, STACK), 87, np.uint8)
     frames[1] = 200
     for frame, (y, x) in zip(frames[2:], rng.integers(0, 80, (30, 2)), strict=True):
         frame[y : y + 4, x : x + 2] = 236
-    encoder = encoders.nature((84, 84, STACK))
-    z = np.asarray(jit(lambda key, x: encoder.apply(encoder.init(key), x))(jax.random.key(0), frames))
-    np.testing.assert_allclose(z[:2], 0, atol=1e-4)
-    assert 0.05 < z[2:].std(0).mean() < 2
-    on = (z[2:] > 0).mean(0)
-    assert np.mean((on > 0) & (on < 1)) > 0.5
+    for options, started in (({"init": "he", "zero_sum": True, "gain": 32.0}, True), ({}, False)):
+        encoder = encoders.nature((84, 84, STACK), **options)
+        z = np.asarray(jit(lambda key, x, e=encoder: e.apply(e.init(key), x))(jax.random.key(0), frames))
+        assert np.allclose(z[:2], 0, atol=1e-4) == started
+        assert (0.05 < z[2:].std(0).mean() < 2) == started
+        on = (z[2:] > 0).mean(0)
+        assert (np.mean((on > 0) & (on < 1)) > 0.5) == started
+
+
+@pytest.mark.parametrize("option", [{"init": "hee"}, {"gain": 0.0}, {"decoder_scale": 2e3}])
+def test_a_start_that_cannot_be_is_refused(option):
+    with pytest.raises(ValueError, match=next(iter(option))):
+        encoders.tiny((42, 42, STACK), **option)
 
 
 @pytest.mark.parametrize("layer_norm", [True, False])

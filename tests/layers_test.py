@@ -211,7 +211,7 @@ def test_a_convolution_starts_as_asked():
         return jit(Conv(64, 5, 1, **options).init)(jax.random.key(0), jnp.zeros((1, 5, 5, 4)))["params"]
 
     # PyTorch's default, U(-1/sqrt(fan_in), 1/sqrt(fan_in)), with 5 * 5 * 4 = 100 inputs.
-    textbook, he, centred = start(), start(init="he"), start(zero_sum=True)
+    textbook, he, centred = start(), start(initial="he"), start(zero_sum=True)
     for leaf in (textbook["kernel"], textbook["bias"]):
         assert 0.09 < np.abs(leaf).max() <= 0.1
     np.testing.assert_allclose(textbook["kernel"].std(), 0.1 / 3**0.5, rtol=0.03)
