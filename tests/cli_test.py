@@ -128,7 +128,7 @@ def test_short_flags_stand_for_options_of_rl():
     assert _config("--rl=dqn:double=true", "--alpha=1").rl == "dqn:double=true,alpha=1.0"
     assert _config("--rl=rainbow:v_min=-1", "--v_min=-1.0").rl == "rainbow:v_min=-1"
     assert _config("--preset=catch/rl_only", "--noisy_std=0.5").rl == (
-        "rainbow:v_min=-2,v_max=2,noisy_std=0.5,hidden=128"
+        "rainbow:v_min=-2,v_max=2,hidden=128,noisy_std=0.5"
     )
     # A preset's option is overridden like the rest of it; a typed one contradicts.
     assert config_flags.with_rl_options("c51:n_step=1", {"n_step": 3}, False) == "c51:n_step=3"
