@@ -4,6 +4,7 @@ objectives_test.py."""
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 import rlax
 
@@ -288,7 +289,7 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
         ({"init_std": -1.0}, "init_std must be 0 or at least 0.4, the distance of two atoms"),
         ({"init_std": 0.3}, "init_std must be 0 or at least 0.4, the distance of two atoms"),
         ({"init_std": 1.0, "v_min": -100.0, "v_max": 100.0}, "init_std must be 0 or at least 4"),
-        ({"v_min": 1e6, "v_max": 1e6 + 1}, "float32 has no 51 evenly spaced atoms from 1e"),
+        ({"v_min": 1e6, "v_max": 1e6 + 1}, "float32 has no 51 evenly spaced atoms from 1000000.0 to 1000001.0"),
         ({"v_min": -3e38, "v_max": 3e38}, "float32 has no 51 evenly spaced atoms"),
         ({"v_min": 0.0, "v_max": 1e-44}, "float32 has no 51 evenly spaced atoms"),
         ({"priority": "entropy"}, "priority: .*valid: cross_entropy, kl"),
@@ -302,3 +303,33 @@ def test_options_that_cannot_be_are_refused(options, message):
         rl.rainbow(CONTEXT, **options)
     if options.keys() & {"atoms", "v_min", "init_std"}:  # the support matters only where there is one
         rl.rainbow(CONTEXT, distributional=False, **options)
+
+
+@pytest.mark.parametrize("v_max", [10.0, 1000.0])
+def test_values_are_learnt_whatever_the_support(v_max):
+    # An episode of one step that gives a tenth of the largest value: that is what its action is worth.
+    algorithm = rl.rainbow(CONTEXT, noisy=False, hidden=32, n_step=1, v_min=-v_max, v_max=v_max)
+    head = random_params(algorithm.objective.init)
+    online, slow, window = make_case()
+    window = window._replace(
+        rewards=np.full_like(window.rewards, v_max / 10),
+        discounts=np.zeros_like(window.discounts),
+        valid=np.ones_like(window.valid),
+        weight=np.ones_like(window.weight),
+    )
+    adam = optax.adam(1e-2)
+
+    def mean_loss(head):
+        latents = make_latents(online, slow)
+        return algorithm.objective.loss(head, head, latents, window, jax.random.key(0))[0].mean()
+
+    @jit
+    def update(head, state):
+        steps, state = adam.update(jax.grad(mean_loss)(head), state)
+        return optax.apply_updates(head, steps), state
+
+    state = adam.init(head)
+    for _ in range(200):
+        head, state = update(head, state)
+    q = np.asarray(algorithm.q_values(head, online[0]))[np.arange(BATCH), window.actions[:, 0]]
+    np.testing.assert_allclose(q, v_max / 10, rtol=0.1)

@@ -159,7 +159,7 @@ def make_support(v_min: float, v_max: float, atoms: int) -> np.ndarray:
         uneven = np.abs(np.diff(support) / np.float32(spacing) - 1).max()
         width = support[-1] - support[0]
     if not (np.isfinite(width) and np.float32(spacing) > 0 and uneven < 0.01):
-        raise ValueError(f"float32 has no {atoms} evenly spaced atoms from {v_min:g} to {v_max:g}")
+        raise ValueError(f"float32 has no {atoms} evenly spaced atoms from {v_min} to {v_max}")
     return support
 
 
