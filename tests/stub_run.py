@@ -29,7 +29,7 @@ def complete(name, config):
         file.write(b"1234")
     entry = {"bytes": 4, "sha256": hashlib.sha256(b"1234").hexdigest()}
     about = {
-        "format": 2,
+        "format": 3,
         "num_actions": 3,
         "env_steps": 500,
         "updates": 1,
