@@ -289,7 +289,7 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
         ({"init_std": -1.0}, "init_std must be 0 or at least 0.4, the distance of two atoms"),
         ({"init_std": 0.3}, "init_std must be 0 or at least 0.4, the distance of two atoms"),
         ({"init_std": 1.0, "v_min": -100.0, "v_max": 100.0}, "init_std must be 0 or at least 4"),
-        ({"v_min": 1e6, "v_max": 1e6 + 1}, "float32 has no 51 evenly spaced atoms from 1000000.0 to 1000001.0"),
+        ({"v_min": 1e6, "v_max": 1e6 + 1}, "float32 has no 51 .* atoms from 1000000.0 to 1000001.0"),
         ({"v_min": -3e38, "v_max": 3e38}, "float32 has no 51 evenly spaced atoms"),
         ({"v_min": 0.0, "v_max": 1e-44}, "float32 has no 51 evenly spaced atoms"),
         ({"priority": "entropy"}, "priority: .*valid: cross_entropy, kl"),
