@@ -118,7 +118,13 @@ def passes(mode: Mode, active: Collection[str], encoder_optimizer: str) -> tuple
 
     One, of the sum of all losses; but where both kinds of loss train the encoder and `encoder_optimizer` is
     not "summed", RL's and then the representation's, each with an Adam of its own.
+
+    Raises:
+        ValueError: an objective has the name of one of the encoder's groups.
     """
+    for name in (ENCODER, ENCODER_SRL):
+        if name in active:
+            raise ValueError(f"an objective cannot be called {name}: that is a group of the encoder's")
 
     def one(names: tuple[str, ...], moments: str) -> Pass:
         moves = mode.rl_trains_encoder and RL in names

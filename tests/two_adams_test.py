@@ -170,6 +170,8 @@ def test_there_are_two_passes_only_where_both_train_the_encoder():
     assert names("decoupled", (RL,)) == [((RL,), None)]
     assert names("frozen", (RL,)) == [((RL,), None)]
     assert names("pretrain", ("decoder",)) == [(("decoder",), "encoder")]
+    with pytest.raises(ValueError, match="an objective cannot be called encoder"):
+        names("joint", (RL, "encoder"))
 
 
 if __name__ == "__main__":
