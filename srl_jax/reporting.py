@@ -18,6 +18,7 @@ the distance of two rows."""
 
 
 SOMETIMES = ("grad_norm/", "step_ratio/")
+"""How the names of metrics begin that only some updates measure; see `srl_jax.optim.NOT_MEASURED`."""
 
 
 class Means:
