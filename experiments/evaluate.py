@@ -70,19 +70,19 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
 
     import jax
 
-    from srl_jax import loop
+    from srl_jax import actor, loading
     from srl_jax.evaluate import evaluate
 
-    agent, params, manifest = loop.load_agent(FLAGS.run)
+    agent, params, manifest = loading.load_agent(FLAGS.run)
     number = min(FLAGS.games, config.num_envs)
-    env = loop.make_env(config, number, FLAGS.seed, max_steps=config.eval_max_steps)
+    env = actor.make_env(config, "eval", number, seed=FLAGS.seed)
     if manifest.num_actions != env.single_action_space.n:
         raise ConfigError(
             f"{manifest.path}: its policy has {manifest.num_actions} actions, {config.game} has "
             f"{env.single_action_space.n}"
         )
     played = evaluate(
-        loop.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
+        loading.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
         env,
         games=FLAGS.games,
         seed=FLAGS.seed,

@@ -51,13 +51,12 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         episodes: games to play.
         stop: once it says so, the games are left and there is no result.
     """
-    from srl_jax import loop
-    from srl_jax.actor import random_policy, seed_for
+    from srl_jax.actor import make_env, random_policy, seed_for
     from srl_jax.evaluate import evaluate
 
     seed = functools.partial(seed_for, config.seed, "reference policy", policy)
     number = min(episodes, MOST_ENVS)
-    env = loop.make_env(config, number, seed("environments"), max_steps=config.eval_max_steps)
+    env = make_env(config, "eval", number, seed=seed("environments"))
     with contextlib.closing(env), Progress(episodes, "games") as progress:
         began = time.monotonic()
 

@@ -182,15 +182,11 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
             holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)
             stack.enter_context(holding)
         caught = stack.enter_context(signals(again=interrupt))
-        if seeds:
-            from srl_jax import lockstep
-
-            directories = [directory for directory, _ in runs]
-            results = lockstep.train_seeds(
-                config, seeds, directories, resume=manifests, stop=lambda: bool(caught)
-            )
-        else:
-            results = [loop.train(config, path, resume=manifests[0], stop=lambda: bool(caught))]
+        directories = [directory for directory, _ in runs]
+        resumed = manifests if manifests[0] else None
+        results = loop.train_seeds(
+            config, seeds or [config.seed], directories, resume=resumed, stop=lambda: bool(caught)
+        )
         draw([directory for directory, _ in runs], [config for _, config in runs], results)
     if any(result.interrupted for result in results):
         print(f"stopped after {results[0].env_steps} env steps; --resume=auto goes on from there, in {path}")

@@ -6,8 +6,12 @@ import threading
 import zlib
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from typing import Any
 
 import numpy as np
+
+from srl_jax import envs
+from srl_jax.config import Config
 
 Policy = Callable[[np.ndarray, int, float], np.ndarray]
 """(frames uint8 [N, S, H, W], step, epsilon) -> actions int32 [N]; its draws depend on the step."""
@@ -49,6 +53,27 @@ def seed_for(seed: int, *purpose) -> int:
     return int(np.random.SeedSequence([seed, *words]).generate_state(1)[0] >> 1)
 
 
+def make_env(config: Config, purpose: str, num_envs: int, *, seed: int | None = None) -> Any:
+    """The environments of a run's game and protocol, see `srl_jax.envs.make`.
+
+    Args:
+        config: of the run.
+        purpose: a name, whose seeds are its own; in "eval" episodes may take `eval_max_steps`.
+        num_envs: how many.
+        seed: of the environments; None for the run's own of that purpose.
+    """
+    max_steps = config.eval_max_steps if purpose == "eval" else 0
+    return envs.make(
+        config.game,
+        num_envs=num_envs,
+        seed=seed_for(config.seed, purpose, "environments") if seed is None else seed,
+        frame_size=config.frame_size,
+        sticky_actions=config.sticky_actions,
+        noop_max=config.noop_max,
+        max_frames=max(envs.MAX_FRAMES, envs.FRAME_SKIP * max_steps),
+    )
+
+
 def linear(start: float, end: float, steps: int, now: int) -> float:
     """The linear schedule from start to end over so many env steps, constant afterwards."""
     return start + (end - start) * min(1.0, now / steps)
@@ -63,9 +88,9 @@ def random_policy(num_actions: int, rng: np.random.Generator) -> Policy:
     return policy
 
 
-def yielding_thread(name: str) -> ThreadPoolExecutor:
-    """One thread, for environments; it and those that are started in it have a low priority."""
-    return ThreadPoolExecutor(1, name, _yield_to_others)
+def yielding_threads(name: str, number: int) -> ThreadPoolExecutor:
+    """Threads for environments; they and those that are started in them have a low priority."""
+    return ThreadPoolExecutor(number, name, _yield_to_others)
 
 
 def _yield_to_others() -> None:

@@ -1,8 +1,7 @@
 """From a configuration to the functions that it means: encoder, objectives, update, act."""
 
 from collections.abc import Callable, Collection, Sequence
-from functools import wraps
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
 from srl_jax.diagnostics.device import Functions, make_functions
 from srl_jax.modes import MODES, Mode, encoder_learning_rate, second_learning_rate
-from srl_jax.optim import RL, make_optimizer, real_copy
+from srl_jax.optim import RL, make_optimizer
 from srl_jax.rl import Algorithm
 from srl_jax.types import Context, Encoder, Objective, TrainState, Window
 from srl_jax.update import (
@@ -38,8 +37,8 @@ def jit_update(
     Args:
         update: from `make_update`; the result has it as `pure`, and the jitted function as `compiled`.
         plan: its passes.
-        lift: of the function that is jitted, (opt_state, params, rest, window, hyper) -> (what moved,
-            td_error, metrics), to another one: see `srl_jax.lockstep`.
+        lift: from the function that is jitted, (opt_state, params, rest, window, hyper) -> (what moved,
+            td_error, metrics), to another one: see `over_seeds`.
     """
     params = {group for one in plan for group in one.groups}
     opt_state = {moments for one in plan for moments in one.groups.values()}
@@ -85,15 +84,11 @@ class Agent(NamedTuple):
             optimizer's state, and no others: the parameters may still act while it runs.
         update_rl: the update that computes RL's loss alone, where `srl_every` asks for one; else None.
         follow: `srl_jax.update.make_follow`'s, to be called after every `follow_every` updates.
-        act: (state, frames, key, step, epsilon) -> actions, with noise; otherwise `make_act`'s.
-        act_eval: (params, frames, key, step, epsilon) -> actions, without noise.
-        fetch: list of updates' metrics -> the same on the host.
-        agree: (bool) -> whether all seeds of this process say so.
+        act: (params, frames, key, step, epsilon) -> actions, with noise; otherwise `make_act`'s.
+        act_eval: the same without noise.
         shapes: () -> the `TrainState` that `init` gives, in shapes and dtypes.
-        export: state -> this seed's `TrainState`.
-        adopt: `TrainState` of arrays on the host or the device -> a state of copies.
         hyper: the numbers of an update.
-        measures: what `srl_jax.diagnostics` asks of the device; of one seed's state.
+        measures: what `srl_jax.diagnostics` asks of the device.
     """
 
     mode: Mode
@@ -108,11 +103,7 @@ class Agent(NamedTuple):
     follow_every: int
     act: Callable
     act_eval: Callable
-    fetch: Callable
-    agree: Callable
     shapes: Callable
-    export: Callable
-    adopt: Callable
     hyper: Hyper
     measures: Functions
 
@@ -172,7 +163,6 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         act = make_act(encoder, algorithm.q_values, noisy=noisy)
         return jax.jit(lambda params, *rest: act(params["encoder"], params[RL], *rest))
 
-    act = jitted_act(noisy=True)
     init = make_init(
         encoder,
         terms,
@@ -193,13 +183,9 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         update_rl=jitted_update({RL}) if config.srl_every > 1 else None,
         follow=jax.jit(make_follow(terms)),
         follow_every=follow_every(terms),
-        act=wraps(act.__wrapped__)(lambda state, *rest: act(state.params, *rest)),
+        act=jitted_act(noisy=True),
         act_eval=jitted_act(noisy=False),
-        fetch=jax.device_get,
-        agree=lambda said: said,
         shapes=lambda: jax.eval_shape(init, jax.random.key(0)),
-        export=lambda state: state,
-        adopt=real_copy,
         hyper=Hyper(
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},
@@ -207,4 +193,74 @@ def make_agent(config: Config, num_actions: int) -> Agent:
         measures=make_functions(
             encoder, terms, mode, augment=config.augment, target_encoder=config.target_encoder
         ),
+    )
+
+
+class Seeds(NamedTuple):
+    """An agent's functions for S seeds in one process. On the device these have an axis [S] in front.
+
+    Of one seed it has none, so that nothing differs from the agent's own functions.
+
+    Attributes:
+        update, update_rl: (TrainState, [Window] of the seeds, Hyper) -> (TrainState, td_error, metrics).
+        follow: TrainState -> TrainState.
+        act: (params, [frames uint8 [N, S, H, W]], [key], step, epsilon) -> actions.
+        stack: [tree of each seed] -> tree.
+        part: (tree, i) -> the tree of seed i, on the device.
+        rows: tree -> [tree of each seed], on the host; waits for the device.
+    """
+
+    update: Callable
+    update_rl: Callable | None
+    follow: Callable
+    act: Callable
+    stack: Callable
+    part: Callable
+    rows: Callable
+
+
+def over_seeds(agent: Agent, number: int) -> Seeds:
+    """Lifts an agent's functions to an axis of seeds by `jax.vmap`; worth it on an accelerator.
+
+    A seed in company is the same run as alone but for the order of sums in products.
+    """
+    if number == 1:
+
+        def alone(update: Callable) -> Callable:
+            return lambda state, windows, hyper: update(state, windows[0], hyper)
+
+        return Seeds(
+            update=alone(agent.update),
+            update_rl=agent.update_rl and alone(agent.update_rl),
+            follow=agent.follow,
+            act=lambda params, frames, keys, *now: agent.act(params, frames[0], keys[0], *now),
+            stack=lambda trees: trees[0],
+            part=lambda tree, i: tree,
+            rows=lambda tree: [jax.device_get(tree)],
+        )
+
+    def stacked(trees: Sequence[Any]) -> Any:
+        return jax.tree.map(lambda *x: jnp.stack(x), *trees)
+
+    def lift(change: Callable) -> Callable:
+        several = jax.vmap(change, in_axes=(0, 0, 0, 0, None))
+        # Windows are stacked on the device, not on the host.
+        return lambda opt_state, params, rest, windows, hyper: several(
+            opt_state, params, rest, stacked(windows), hyper
+        )
+
+    act = jax.vmap(agent.act.__wrapped__, in_axes=(0, 0, 0, None, None))
+
+    def rows(tree: Any) -> list[Any]:
+        tree = jax.device_get(tree)
+        return [jax.tree.map(lambda x: x[i], tree) for i in range(number)]  # noqa: B023
+
+    return Seeds(
+        update=agent.update.lifted(lift),
+        update_rl=agent.update_rl and agent.update_rl.lifted(lift),
+        follow=jax.jit(jax.vmap(agent.follow.__wrapped__)),
+        act=jax.jit(lambda params, frames, keys, *now: act(params, jnp.stack(frames), jnp.stack(keys), *now)),
+        stack=jax.jit(stacked),
+        part=jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree)),
+        rows=rows,
     )

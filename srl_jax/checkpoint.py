@@ -433,6 +433,33 @@ def load_array(manifest: Manifest, name: str, into: np.ndarray | None = None) ->
     return array
 
 
+class Arrays(Mapping):
+    """A checkpoint's arrays whose names begin with a prefix, without it; read anew whenever one is asked for.
+
+    Args:
+        manifest: the checkpoint's, which `verify` has found whole.
+        prefix: what the names begin with.
+    """
+
+    def __init__(self, manifest: Manifest, prefix: str):
+        self._manifest, self._prefix = manifest, prefix
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        return load_array(self._manifest, self._prefix + name)
+
+    def __iter__(self) -> Iterator[str]:
+        start = len(self._prefix)
+        return (
+            n[start:-4] for n in self._manifest.files if n.startswith(self._prefix) and n.endswith(".npy")
+        )
+
+    def __contains__(self, name: object) -> bool:
+        return f"{self._prefix}{name}.npy" in self._manifest.files
+
+    def __len__(self) -> int:
+        return len(list(self))
+
+
 def load_numbers(manifest: Manifest) -> dict[str, Any]:
     """What run.json holds.
 

@@ -152,6 +152,10 @@ class Config:
         int, 0, "the encoder of every so manyth checkpoint is kept in encoders/; 0: none", "checkpoints",
         minimum=0,
     )  # fmt: skip
+    keep_best: bool = _value(bool, True, "the parameters of the best evaluation so far are kept in best/")
+    keep_replay: bool = _value(
+        bool, False, "the last checkpoint holds replay, too, so that a finished run can be extended"
+    )
     diagnostics: bool = _value(
         bool, True, "measure the latent at each evaluation: drift, rank, gradient conflict, probes"
     )

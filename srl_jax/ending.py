@@ -8,7 +8,6 @@ import contextlib
 import json
 import os
 from pathlib import Path
-from threading import BrokenBarrierError
 from typing import NamedTuple
 
 from srl_jax.errors import ConfigError, Diverged, SaveError
@@ -45,9 +44,7 @@ def of(error: BaseException, env_steps: int) -> Ending:
         error: whatever it was.
         env_steps: that the run had done.
     """
-    if isinstance(
-        error, KeyboardInterrupt | BrokenBarrierError
-    ):  # the latter where another seed was the first
+    if isinstance(error, KeyboardInterrupt):
         return Ending("stopped", env_steps)
     line = " ".join(str(error).split())
     if isinstance(error, Diverged):  # what follows is advice for whoever watches

@@ -1,5 +1,7 @@
 """What a run may end with, apart from its end: errors of one line, each with an exit status of its own."""
 
+from pathlib import Path
+
 
 class ConfigError(ValueError):
     """A setting that cannot be run; one line that names the flag and the valid choices. Exit status 2."""
@@ -10,7 +12,15 @@ class SaveError(Exception):
 
 
 class Diverged(Exception):
-    """A loss is NaN or infinite; one line with the step and its name. Exit status 4."""
+    """A loss is NaN or infinite; one line with the step and its name. Exit status 4.
+
+    Attributes:
+        run: the directory of the run whose loss it is; None where nobody said.
+    """
+
+    def __init__(self, message: str, run: Path | None = None):
+        super().__init__(message)
+        self.run = run
 
 
 EXIT_STATUS = {ConfigError: 2, SaveError: 3, Diverged: 4}

@@ -24,6 +24,8 @@ _TERMINAL = 2  # the discount of this step is 0
 _ARRAYS = ("actions", "rewards", "flags", "age", "next_position", "episode_start", "active")
 _NUMBERS = ("max_priority", "num_transitions", "num_sampleable")
 
+CHUNK_BYTES = 1 << 25
+"""Size of the chunks of frames in a snapshot: what a checkpoint writes anew where a frame has changed."""
 PRIORITY_EPSILON = 1e-6
 """Added to |TD error|, so that every transition keeps a chance (Schaul et al. 2016, sec. 3.3)."""
 
@@ -267,32 +269,69 @@ class Replay:
         self.max_priority = float(priorities.max(initial=self.max_priority))
 
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All state but the frames: arrays, some of them views, and numbers that JSON can hold.
+        """All state: arrays, some of them views, and numbers that JSON can hold.
 
-        They are for `restore`. A view shows later changes: write it, or copy it, before the next call.
+        They are for `restore`. A view shows later changes: write it, or copy it, before the next call. Frames
+        come in chunks of `CHUNK_BYTES`, "frames_00000" and so on, of the slots that were ever written.
         """
+        arrays, numbers = self._bookkeeping()
+        return arrays | {name: self.frames[:, slots] for name, slots in self._chunks()}, numbers
+
+    def _bookkeeping(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+        """All state but the frames."""
         arrays = {name: getattr(self, name) for name in _ARRAYS} | {"priorities": self.tree.leaves}
         numbers = {name: getattr(self, name) for name in _NUMBERS} | {"rng": self.rng.bit_generator.state}
         return arrays, numbers
+
+    def _chunks(self) -> list[tuple[str, slice]]:
+        """Names and slots of the chunks of frames."""
+        size = max(1, CHUNK_BYTES // (self.num_streams * int(np.prod(self.frame_shape))))
+        filled = min(int(self.next_position.max()), self.slots)
+        return [
+            (f"frames_{start // size:05d}", slice(start, min(start + size, self.slots)))
+            for start in range(0, filled, size)
+        ]
+
+    def unchanged_chunks(self, since: np.ndarray) -> list[str]:
+        """Names of the chunks of a snapshot that hold what they held at an earlier moment.
+
+        Args:
+            since: int64 [N], a copy of `next_position` of that moment; zeros for the very start.
+
+        Raises:
+            ValueError: this replay was never there.
+        """
+        changed = self.changed_slots(since)
+        return [name for name, slots in self._chunks() if not changed[slots].any()]
 
     def restore(self, arrays: Mapping[str, np.ndarray], numbers: Mapping[str, Any]) -> None:
         """Takes over the state of a `snapshot`; whatever is done next then has the same results to the bit.
 
         Args:
-            arrays, numbers: from a replay that was made with the same arguments. Its frames are already in
-                `frames`.
+            arrays, numbers: from a replay that was made with the same arguments. Each chunk of frames is
+                asked for once, so that arrays may be read from disk then.
 
         Raises:
             ValueError: something is missing, has another shape or dtype, or contradicts the rest, in one
-                line; nothing is changed then.
+                line; nothing but frames is changed then.
         """
-        rng = self._check_snapshot(arrays, numbers)
+        frames = {name for name in arrays if name.startswith("frames_")}
+        rng = self._check_snapshot({name: arrays[name] for name in arrays if name not in frames}, numbers)
         for name in _ARRAYS:
             getattr(self, name)[...] = arrays[name]
         for name in _NUMBERS:
             setattr(self, name, numbers[name])
         self.tree.fill(arrays["priorities"])
         self.rng = rng
+        if frames != {name for name, _ in self._chunks()}:
+            raise ValueError(
+                f"replay snapshot: chunks of frames must be {', '.join(n for n, _ in self._chunks())}"
+            )
+        for name, slots in self._chunks():
+            chunk, own = arrays[name], self.frames[:, slots]
+            if (chunk.shape, chunk.dtype) != (own.shape, own.dtype):
+                raise ValueError(f"replay snapshot: {name} must be {own.dtype} {own.shape}")
+            own[:] = chunk
 
     def changed_slots(self, since: np.ndarray) -> np.ndarray:
         """Which slots, bool [L], had a frame written in any stream since an earlier moment.
@@ -309,13 +348,9 @@ class Replay:
         laps_behind = (np.arange(self.slots) - since[:, None]) % self.slots
         return (laps_behind < (self.next_position - since)[:, None]).any(axis=0)
 
-    def filled_slots(self) -> int:
-        """How many slots, from the first on, have ever been written in any stream."""
-        return min(int(self.next_position.max()), self.slots)
-
     def _check_snapshot(self, arrays, numbers):
         """The generator of a snapshot, if everything in it is a state that a replay like this can be in."""
-        own_arrays, own_numbers = self.snapshot()
+        own_arrays, own_numbers = self._bookkeeping()
         for what, given, own in (("arrays", arrays, own_arrays), ("numbers", numbers, own_numbers)):
             if not isinstance(given, Mapping) or given.keys() != own.keys():
                 raise ValueError(f"replay snapshot: the {what} must be {', '.join(own)}")

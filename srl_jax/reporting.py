@@ -1,7 +1,7 @@
 """What a run says of itself: rows of metrics.jsonl, the progress bar, and the means between two rows."""
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -9,62 +9,43 @@ import numpy as np
 
 from srl_jax.display import Display
 from srl_jax.errors import SaveError
+from srl_jax.evaluate import Evaluation
 from srl_jax.metrics import Mark, MetricsWriter
 from srl_jax.progress import Progress
-
-FOLD_EVERY = 100
-"""Updates after which their metrics are fetched from the device and summed, so that memory does not grow with
-the distance of two rows."""
-
 
 SOMETIMES = ("grad_norm/", "step_ratio/")
 """How the names of metrics begin that only some updates measure; see `srl_jax.optim.NOT_MEASURED`."""
 
 
 class Means:
-    """The mean of each metric over the updates that measured it, with bounded memory.
+    """The mean of each metric over the updates that measured it.
 
     Metrics whose names begin with one of `SOMETIMES` are negative where they were not measured. Sums are
     float64, in the order of the updates.
-
-    Args:
-        fetch: list of updates' metrics, {name: scalar on the device} -> the same on the host.
     """
 
-    def __init__(self, fetch: Callable[[list[dict]], list[dict]]):
-        self._fetch = fetch
-        self._waiting: list[dict] = []
+    def __init__(self):
         self._sums: dict[str, tuple[float, int]] = {}
 
-    def add(self, metrics: dict[str, Any]) -> None:
-        """Takes an update's metrics; does not wait for the device, but every `FOLD_EVERY`th time."""
-        self._waiting.append(metrics)
-        if len(self._waiting) >= FOLD_EVERY:
-            self._fold()
-
-    def _fold(self) -> None:
-        for row in self._fetch(self._waiting):
-            for name, x in row.items():
-                if not (name.startswith(SOMETIMES) and x < 0):
-                    total, count = self._sums.get(name, (0.0, 0))
-                    self._sums[name] = total + float(x), count + 1
-        self._waiting = []
+    def add(self, metrics: Mapping[str, Any]) -> None:
+        """Takes an update's metrics, scalars on the host."""
+        for name, x in metrics.items():
+            if not (name.startswith(SOMETIMES) and x < 0):
+                total, count = self._sums.get(name, (0.0, 0))
+                self._sums[name] = total + float(x), count + 1
 
     def broken(self) -> str | None:
-        """The name of a loss that was NaN or infinite since the last row, or None. Waits for the device."""
-        self._fold()
+        """The name of a loss that was NaN or infinite since the last row, or None."""
         names = sorted(self._sums, key=lambda name: name == "loss/total")
         return next((n for n in names if n.startswith("loss/") and not np.isfinite(self._sums[n][0])), None)
 
     def take(self) -> dict[str, np.float32]:
-        """The means, and starts anew. Waits for the device."""
-        self._fold()
+        """The means, and starts anew."""
         sums, self._sums = self._sums, {}
         return {name: np.float32(total / count) for name, (total, count) in sums.items()}
 
     def snapshot(self) -> dict[str, list]:
         """As JSON values, exact."""
-        self._fold()
         return {name: [total.hex(), count] for name, (total, count) in self._sums.items()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
@@ -85,16 +66,15 @@ class Report:
     Args:
         out: the run directory.
         total: env steps of the whole run.
-        fetch: see `Means`.
         progress: whether to draw a progress bar on stderr.
         tensorboard: whether to write its events.
     """
 
-    def __init__(self, out: Path, total: int, fetch: Callable, *, progress: bool, tensorboard: bool):
+    def __init__(self, out: Path, total: int, *, progress: bool, tensorboard: bool):
         self.path = Path(out or ".") / "metrics.jsonl"
         self._events = self.path.parent / "tensorboard" if tensorboard else None
         self.progress = Progress(total, stream=None if progress else Display(None))
-        self.means = Means(fetch)
+        self.means = Means()
         self._started = time.perf_counter()
         self._return_sum, self._episodes = 0.0, 0  # of training episodes that ended since the last row
         self._last_row = 0.0, 0  # seconds, env steps
@@ -148,6 +128,22 @@ class Report:
     def eval_row(self, env_steps: int, updates: int, values: Mapping[str, Any]) -> None:
         """An "eval" row."""
         self._write("eval", env_steps, updates, self.seconds, values)
+
+    def evaluation(
+        self, env_steps: int, updates: int, played: Evaluation, seconds: float, values: Mapping[str, Any]
+    ) -> float:
+        """An "eval" row of games and of other values of the same moment; the mean return."""
+        mean = float(np.mean(played.returns))
+        own = {
+            "eval/return_mean": mean,
+            "eval/returns": played.returns,
+            "eval/lengths": played.lengths,
+            "wall_eval_s": round(seconds, 3),
+        }
+        self.eval_row(env_steps, updates, own | dict(values))
+        games = f"{len(played.returns)} games, {seconds:.1f} s"
+        self.progress.note(f"evaluation after {env_steps} env steps: mean return {mean:.2f} over {games}")
+        return mean
 
     def _write(self, kind: str, env_steps: int, updates: int, seconds: float, values: Mapping) -> None:
         try:

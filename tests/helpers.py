@@ -161,6 +161,13 @@ def zero_leaves(tree) -> list[str]:
     return [jax.tree_util.keystr(path) for path, x in leaves if not np.any(np.asarray(x))]
 
 
+def one_run(config: Config, path: Path | None = None, **options):
+    """A `srl_jax.loop.Run` of one seed."""
+    from srl_jax.loop import Run
+
+    return Run([config], [path or Path()], **options)
+
+
 def write_run(
     path: Path, returns=(1.0, 2.0), every: int = 100, ended: Ending | None = None, **values
 ) -> Path:

@@ -14,13 +14,15 @@ import jax
 import numpy as np
 import pytest
 
-from srl_jax import checkpoint, ending, loop
+from srl_jax import actor, checkpoint, ending, loading, loop, schedules
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.modes import ENCODER_OPTIMIZERS
-from srl_jax.update import Hyper
-from tests.helpers import JOINT, SMALL, identical
+from srl_jax.replay import Replay
+from srl_jax.reporting import Report
+from srl_jax.types import Window
+from tests.helpers import JOINT, SMALL, identical, one_run
 
 
 def train(path, progress=False, stop=None, **values):
@@ -66,7 +68,7 @@ def files_of(path):
 
 def test_neither_timing_nor_diagnostics_change_anything(joint, tmp_path, monkeypatch):
     path, _ = joint
-    rng, act_and_step, update = np.random.default_rng(0), loop.act_and_step, loop.Run.update
+    rng, act_and_step, update = np.random.default_rng(0), loop.Run.act_and_step, loop.Run.update
 
     def slow_step(*arguments):
         time.sleep(rng.choice([0, 0.02]))
@@ -78,11 +80,11 @@ def test_neither_timing_nor_diagnostics_change_anything(joint, tmp_path, monkeyp
         time.sleep(rng.choice([0, 0.02]))
         update(run)
 
-    monkeypatch.setattr(loop, "act_and_step", slow_step)
+    monkeypatch.setattr(loop.Run, "act_and_step", slow_step)
     monkeypatch.setattr(loop.Run, "update", slow_update)
     train(tmp_path / "again", **JOINT, seed=3)
     ours, theirs = files_of(tmp_path / "again"), files_of(path)
-    assert ours == {name: sums for name, sums in theirs.items() if name.parent.name == "checkpoints"}
+    assert ours == {name: sums for name, sums in theirs.items() if name.parent.name != "encoders"}
     rows, diagnosed = (
         [strip_wall(row) for row in read_metrics(p / "metrics.jsonl")] for p in (tmp_path / "again", path)
     )
@@ -120,16 +122,25 @@ def test_representation_losses_in_every_third_update(tmp_path, monkeypatch):
 
 
 def test_a_step_acts_with_the_parameters_from_before_its_updates():
-    run = loop.Run(Config(**{**SMALL, "updates_per_step": 0.5}), None, False)
-    acted = []
-    act = run.agent.act
-    run.agent = run.agent._replace(
-        act=lambda state, *rest: acted.append(int(state.step)) or act(state, *rest)
-    )
-    run.start()
+    run = one_run(Config(**{**SMALL, "updates_per_step": 0.5}))
+    acted, known = [], []
+
+    def act(params, *rest):  # the state of so many updates has these parameters
+        acted.append(next(i for i, x in enumerate(known) if x is params))
+        return device.act(params, *rest)
+
+    def update(*arguments):
+        state, *rest = device.update(*arguments)
+        known.append(state.params)
+        return state, *rest
+
+    device = run.device
+    run.device = device._replace(act=act, update=update)
+    known.append(run.state.params)
+    run.begin()
     for _ in range(14):
         run.step()
-    run.env_thread.shutdown()
+    run.env_threads.shutdown()
     # Two updates a step of four environments, from the step on that starts at 40.
     assert acted == [0] * 11 + [2, 4, 6] and run.updates == 8
 
@@ -165,7 +176,7 @@ def test_rows_of_a_run(joint):
 def test_pictures_show_input_target_and_output(joint):
     _, result = joint
     (inputs, targets, outputs) = result.pictures["reconstruction"]
-    assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 42, 4)
+    assert inputs.shape == targets.shape == outputs.shape == (6, 42, 42, 4)
     np.testing.assert_allclose(inputs, targets, atol=1e-7)  # reconstruction's target is its input
     assert 0 <= inputs.min() and inputs.max() <= 1
 
@@ -180,7 +191,7 @@ def test_the_last_evaluation_was_recorded(joint):
 
 def test_an_agent_comes_back_from_its_checkpoint(joint):
     path, _ = joint
-    agent, params, manifest = loop.load_agent(path)
+    agent, params, manifest = loading.load_agent(path)
     assert (manifest.env_steps, manifest.updates) == (240, 25)
     assert set(params) == {"encoder", "rl", "reconstruction", "latent_l2"}
     assert set(agent.objectives) == {"rl", "reconstruction", "latent_l2"}
@@ -224,33 +235,33 @@ def test_a_buffer_that_cannot_be_is_refused():
     # 4 environments, and windows of 4 + 3 frames, a slot being written and a spare one: 36.
     small = Config(**{**SMALL, "buffer_size": 35, "learn_start": 0})
     with pytest.raises(ConfigError, match="--buffer_size=35: capacity must be at least 36, got 35"):
-        loop.Run(small, None, False)
+        one_run(small)
 
 
 @pytest.mark.parametrize(("eval_max_steps", "frames"), [(100, 108_000), (27_000, 108_000), (40_000, 160_000)])
 def test_no_evaluation_game_is_cut_before_eval_max_steps(monkeypatch, eval_max_steps, frames):
     made = []
     monkeypatch.setattr("srl_jax.envs.make", lambda game, **options: made.append(options["max_frames"]))
-    run = SimpleNamespace(config=Config(game="Pong", eval_max_steps=eval_max_steps))
-    loop.Run.make_env(run, "eval", 1)
-    loop.Run.make_env(run, "train", 1)  # whose episodes are as long as ever
+    config = Config(game="Pong", eval_max_steps=eval_max_steps)
+    actor.make_env(config, "eval", 1)
+    actor.make_env(config, "train", 1)  # whose episodes are as long as ever
     assert made == [frames, 108_000]
 
 
 def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypatch, capsys):
     from experiments import evaluate
 
-    asked, make = [], loop.make_env
+    asked, make = [], actor.make_env
 
     def make_env(*arguments, **options):
-        asked.append(options)
+        asked.append((arguments[1:], options))
         return make(*arguments, **options)
 
-    monkeypatch.setattr(loop, "make_env", make_env)
+    monkeypatch.setattr(actor, "make_env", make_env)
     given = {"run": str(joint[0]), "games": 1, "seed": 0, "epsilon": None, "gif": "", "tune_runtime": "off"}
     monkeypatch.setattr(evaluate, "FLAGS", SimpleNamespace(**given))
     evaluate.main([])
-    assert asked == [{"max_steps": 27_000}]
+    assert asked == [(("eval", 1), {"seed": 0})]
     assert len(json.loads(capsys.readouterr().out)["returns"]) == 1
 
 
@@ -262,7 +273,7 @@ def test_a_checkpoint_that_asks_for_what_there_is_not_is_refused_by_its_name(joi
     for change, reason in (({"rl": "x"}, "no 'x'"), ({"encoder": "sac_ae:features=0"}, "features must be")):
         checkpoint.sign(manifest.parent, {**values, "config": {**values["config"], **change}})
         with pytest.raises(ConfigError, match=f"^{re.escape(str(manifest.parent))}.*{reason}"):
-            loop.load_agent(tmp_path / "copy")
+            loading.load_agent(tmp_path / "copy")
 
 
 def test_an_encoder_that_does_not_fit_is_refused(joint):
@@ -274,14 +285,14 @@ def test_an_encoder_that_does_not_fit_is_refused(joint):
 
 
 def test_ctrl_c_in_the_middle_of_a_step_leaves_the_last_checkpoint(tmp_path, monkeypatch, capsys):
-    original = loop.Replay.add
+    original = Replay.add
 
     def add(self, *arguments):
         original(self, *arguments)
         if self.num_transitions >= 100:
             raise KeyboardInterrupt
 
-    monkeypatch.setattr(loop.Replay, "add", add)
+    monkeypatch.setattr(Replay, "add", add)
     path = tmp_path / "run"
     result = train(path, **JOINT, checkpoint_every=40, progress=True)
     # The step from 96 to 100 was being added; it does not count.
@@ -389,18 +400,19 @@ def test_a_disk_that_is_full_ends_the_run_and_leaves_the_checkpoint_before(tmp_p
 
 
 def test_a_row_that_cannot_be_written_ends_the_run_with_its_threads(tmp_path, monkeypatch):
-    write = loop.Report.eval_row
+    write = Report.eval_row
 
-    def full(self, *arguments):
-        self._writer._file.close()
-        self._writer._file = open("/dev/full", "ab")
-        write(self, *arguments)
+    def full(self, env_steps, *arguments):
+        if env_steps:
+            self._writer._file.close()
+            self._writer._file = open("/dev/full", "ab")
+        write(self, env_steps, *arguments)
 
-    monkeypatch.setattr(loop.Report, "eval_row", full)
+    monkeypatch.setattr(Report, "eval_row", full)
     before = threading.active_count()
     with pytest.raises(SaveError, match="metrics.jsonl: a row was not written: No space left"):
         train(tmp_path / "run", checkpoint_every=20)
-    assert whole(tmp_path / "run").env_steps == 20
+    assert whole(tmp_path / "run").env_steps == 120  # before the evaluation whose row it is
     assert threading.active_count() <= before
 
 
@@ -414,25 +426,25 @@ def test_early_stop(tmp_path):
 
 def test_the_encoder_of_a_run_of_a_checkpoint_and_one_that_was_kept(joint):
     path, _ = joint
-    agent, params, _ = loop.load_agent(path)
+    agent, params, _ = loading.load_agent(path)
     observations = np.random.default_rng(0).integers(0, 256, (2, 42, 42, 4), dtype=np.uint8)
     newest = whole(path).path
     for place in (path, path / "checkpoints", newest):
-        encoder, mine, manifest = loop.load_encoder(place)
+        encoder, mine, manifest = loading.load_encoder(place)
         assert manifest.path == newest and identical(mine, params["encoder"])
     latents = encoder.apply(mine, observations)
     assert latents.shape == (2, 8) and identical(
         latents, agent.encoder.apply(params["encoder"], observations)
     )
     kept = path / "encoders" / "000000000"
-    encoder, first, manifest = loop.load_encoder(kept)
+    encoder, first, manifest = loading.load_encoder(kept)
     assert manifest.env_steps == 0 and not identical(encoder.apply(first, observations), latents)
     # There is no policy to play with in it, wherever it lies.
     for place in (kept, shutil.copytree(kept, path.parent / "elsewhere")):
         with pytest.raises(ConfigError, match=f"^{place}: a kept encoder, without a policy; name the run or"):
-            loop.load_agent(place)
+            loading.load_agent(place)
     with pytest.raises(ConfigError, match="no checkpoint there"):
-        loop.load_encoder(path / "figures")
+        loading.load_encoder(path / "figures")
 
 
 def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
@@ -472,21 +484,15 @@ def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
 
 def test_updates_are_compiled_once(joint):
     del joint
-    run = loop.Run(Config(**SMALL, lr_final=0.5), None, False)
-    from srl_jax.replay import Window  # the type that replay gives
-
-    run.replay.begin(run.env.reset()[0])
+    run = one_run(Config(**SMALL, lr_final=0.5))
+    (seed,) = run.seeds
+    run.begin()
     for _ in range(30):
-        out = run.env.step(np.ones(4, np.int32))
-        over = out[2] | out[3]
-        run.replay.add(np.ones(4, np.int32), out[1], out[2], out[3], out[4]["life_lost"], out[0])
-        if over.any():
-            frames, _ = run.env.reset(options={"reset_mask": over})
-            run.replay.begin(frames[over], np.flatnonzero(over))
+        seed.take(seed.step_env(np.ones(4, np.int32)))
     for _ in range(3):
         run.update()
         run.env_steps += 40  # another learning rate
-    assert isinstance(run.replay.sample(2, 0.5)[0], Window)
+    assert isinstance(seed.replay.sample(2, 0.5)[0], Window)
     assert run.agent.update.compiled._cache_size() == 1
 
 
@@ -498,30 +504,23 @@ def test_config_is_data(joint):
 
 
 def test_learning_rates_fall_linearly_to_the_share_that_is_left():
-    rates = {"encoder": 0.0, "rl": 4e-3}
-    hyper = Hyper({"rl": np.float32(1)}, {name: np.float32(rate) for name, rate in rates.items()})
+    def at(env_steps, lr_final):
+        config = Config(**{**SMALL, "steps": 200, "lr_final": lr_final})
+        rates = schedules.learning_rates(config, {"encoder": 0.0, "rl": 4e-3}, env_steps)
+        assert all(rate.dtype == np.float32 for rate in rates.values())
+        return rates
 
-    def at(env_steps, **values):
-        config = Config(**{**SMALL, "steps": 200, **values})
-        run = SimpleNamespace(
-            agent=SimpleNamespace(hyper=hyper), config=config, env_steps=env_steps, learning_rates=rates
-        )
-        return loop.Run.hyper.fget(run)
-
-    assert at(150) is hyper  # by default they stay as they are
-    assert at(0, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 4e-3})
-    assert at(150, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 1.6e-3})
-    assert at(200, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 0.8e-3})
-    assert at(150, lr_final=0.2).weights == hyper.weights
-    assert all(rate.dtype == np.float32 for rate in at(150, lr_final=0.2).learning_rates.values())
+    assert at(150, 1.0) == pytest.approx({"encoder": 0.0, "rl": 4e-3})
+    assert at(0, 0.2) == pytest.approx({"encoder": 0.0, "rl": 4e-3})
+    assert at(150, 0.2) == pytest.approx({"encoder": 0.0, "rl": 1.6e-3})
+    assert at(200, 0.2) == pytest.approx({"encoder": 0.0, "rl": 0.8e-3})
 
 
 def started(tmp_path, **values):
     """The parameters that a run begins with."""
-    run = loop.Run(Config(**{**SMALL, **values}), tmp_path, progress=False)
-    run.env.close()
-    run.env_thread.shutdown()
-    return run.state.params
+    run = one_run(Config(**{**SMALL, **values}), tmp_path)
+    with run:
+        return run.state.params
 
 
 def test_heads_that_both_runs_have_start_from_the_other_run_as_asked(joint, tmp_path):

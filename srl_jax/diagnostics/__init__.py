@@ -2,7 +2,7 @@
 
     measures.py   the measures, of numpy arrays          rows.py      what they say, out of metrics.jsonl
     heldout.py    the observations that they look at     device.py    the functions of the device
-    measure.py    all of them, for one run
+    measure.py    all of them, for one run               pictures.py  what objectives make of observations
 
 Nothing is drawn from a run's own generators, and nothing that it trains with changes: without diagnostics a
 run is the same, to the bit.

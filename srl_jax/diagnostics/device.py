@@ -1,6 +1,5 @@
 """The functions of the device that diagnostics need: few, and each compiled for one shape."""
 
-import threading
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
@@ -24,14 +23,12 @@ class Functions(NamedTuple):
             targets and outputs the newest two frames, float32 [B, H, W, 2] (of observations of one frame, 1).
         others: names of objectives with an image that need more than that.
         conflict: `srl_jax.update.make_conflict`'s; None where RL and representation losses do not both run.
-        lock: whoever calls one holds it: seeds of one process would each compile them otherwise.
     """
 
     encode: Callable
     decode: Mapping[str, Callable]
     others: tuple[str, ...]
     conflict: Callable | None
-    lock: threading.Lock
 
 
 class MoreLatents(Exception):
@@ -55,7 +52,6 @@ def make_functions(
         decode={name: jax.jit(function) for name, function in ready.items()},
         others=tuple(images.keys() - ready.keys()),
         conflict=conflict,
-        lock=threading.Lock(),
     )
 
 

@@ -3,7 +3,7 @@
 import functools
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,11 +11,13 @@ import jax
 import numpy as np
 
 from srl_jax import checkpoint
+from srl_jax.actor import seed_for
 from srl_jax.config import Config
 from srl_jax.diagnostics import measures
 from srl_jax.diagnostics.device import Functions
 from srl_jax.diagnostics.heldout import HeldOut, collect
 from srl_jax.errors import ConfigError
+from srl_jax.replay import Replay
 from srl_jax.types import Params, TrainState, Window
 from srl_jax.update import Hyper
 
@@ -74,7 +76,7 @@ class Diagnostics:
         return held_out
 
     def measure(
-        self, state: TrainState, env_steps: int, window: Window | None, hyper: Hyper
+        self, state: TrainState, env_steps: int, replay: Replay, beta: float, hyper: Hyper
     ) -> dict[str, float | None | list]:
         """The values of an "eval" row, JSON's own, and seconds as `wall_diag_s`; changes nothing of the run.
 
@@ -83,12 +85,15 @@ class Diagnostics:
         Args:
             state: of the run.
             env_steps: that it has done.
-            window: a batch from replay, for gradients; None for none.
+            replay: of the run; a batch for gradients is drawn from it with a generator of its own.
+            beta: the importance weights' exponent, now.
             hyper: of its next update.
         """
-        with self._functions.lock:
-            began = time.perf_counter()
-            values = self._measure(state, env_steps, window, hyper)
+        began, window = time.perf_counter(), None
+        if self._functions.conflict is not None and len(replay):
+            rng = np.random.default_rng(seed_for(self._config.seed, "diagnostics", env_steps))
+            window, _ = replay.sample(self._config.batch_size, beta, rng)
+        values = self._measure(state, env_steps, window, hyper)
         plain = {f"diag/{name}": _plain(value) for name, value in values.items()}
         return plain | {"wall_diag_s": round(time.perf_counter() - began, 3)}
 
@@ -202,26 +207,6 @@ def kept_steps(config: Config) -> tuple[int, ...]:
     indices = {i * evaluations // number for i in range(number)}
     # The loop evaluates after the first step that reaches a multiple.
     return tuple(sorted(-(-i * config.eval_every // config.num_envs) * config.num_envs for i in indices))
-
-
-def check_diagnosed(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What `Diagnostics.measure` gave, by way of JSON.
-
-    Raises:
-        ValueError, TypeError: it is something else.
-    """
-
-    def number(value: Any) -> bool:
-        return value is None or (type(value) in (int, float) and abs(value) < 2.0**128)
-
-    if type(values) is not dict:
-        raise TypeError("diagnostics are no object")
-    for name, value in values.items():
-        if not (name.startswith("diag/") or name == "wall_diag_s"):
-            raise ValueError(f"{name!r:.50} is no diagnostic")
-        if not all(map(number, value if type(value) is list else [value])):
-            raise ValueError(f"{name} is not made of numbers")
-    return values
 
 
 def _plain(value: Any) -> Any:

@@ -1,8 +1,6 @@
-"""srl_jax/lockstep.py: several seeds in one process are the runs that they would be alone."""
+"""Several seeds in one process are the runs that they would be alone."""
 
 import itertools
-import threading
-import time
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import pytest
 from srl_jax import checkpoint, ending, loop
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged
-from srl_jax.lockstep import Together, train_seeds
+from srl_jax.loop import train_seeds
 from srl_jax.metrics import read_metrics, strip_wall
 
 CONFIG = dict(
@@ -18,45 +16,6 @@ CONFIG = dict(
     rl="rainbow:hidden=8,atoms=5,v_min=-1,v_max=1", buffer_size=200, batch_size=4, updates_per_step=0.25,
     learn_start=40, steps=120, eval_every=60, eval_games=2, log_every=20, slow_update_every=4, srl_every=2,
 )  # fmt: skip
-
-
-def in_threads(functions):
-    """What each returned or raised."""
-    results = [None] * len(functions)
-
-    def run(i):
-        try:
-            results[i] = functions[i]()
-        except Exception as error:
-            results[i] = error
-
-    threads = [threading.Thread(target=run, args=(i,)) for i in range(len(functions))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join(timeout=60)
-    assert not any(thread.is_alive() for thread in threads)
-    return results
-
-
-def test_together_collects_by_seed_and_calls_once():
-    calls = []
-    together = Together(lambda arguments: calls.append(arguments) or [a * b for a, b in arguments], 3)
-    results = in_threads([lambda i=i: [together.member(i)(i, 2), together.member(i)(i, 5)] for i in range(3)])
-    assert calls == [[(0, 2), (1, 2), (2, 2)], [(0, 5), (1, 5), (2, 5)]]
-    assert results == [[0, 0], [2, 5], [4, 10]]
-
-
-def test_an_error_ends_it_for_all():
-    def fail(arguments):
-        raise ValueError("broken")
-
-    together = Together(fail, 3)
-    results = in_threads([lambda i=i: together.member(i)() for i in range(3)])
-    kinds = sorted(type(error).__name__ for error in results)
-    assert kinds == ["BrokenBarrierError", "BrokenBarrierError", "ValueError"]
-    with pytest.raises(threading.BrokenBarrierError):
-        together.member(0)()
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +66,7 @@ def test_seeds_that_are_stopped_and_go_on_are_those_that_were_not(runs, path, tm
         out.mkdir()
     asked = itertools.count()
     train = lambda **options: train_seeds(Config(**CONFIG), [7, 3], outs, progress=False, **options)  # noqa: E731
-    results = train(stop=lambda: next(asked) >= 2 * stop)  # both ask once a step
+    results = train(stop=lambda: next(asked) >= stop)
     assert [(r.interrupted, r.env_steps) for r in results] == [(True, 2 * stop)] * 2
     manifests = [checkpoint.newest_good(out, pytest.fail) for out in outs]
     assert [(m.env_steps, m.config.seed) for m in manifests] == [(2 * stop, 7), (2 * stop, 3)]
@@ -124,17 +83,12 @@ def test_a_seed_keeps_what_it_can_go_on_from_until_all_have_ended(tmp_path, monk
     outs = [tmp_path / "s7", tmp_path / "s3"]
     for out in outs:
         out.mkdir()
-    slim, save, there = checkpoint.slim, loop.Run.save_parameters, []
-
-    def late(run, *arguments, **options):
-        time.sleep(0.3 if run.config.seed == 3 else 0)
-        save(run, *arguments, **options)
+    slim, there = checkpoint.slim, []
 
     def slimming(manifest):
         there.append([(out / "checkpoints" / "000000120").exists() for out in outs])
         return slim(manifest)
 
-    monkeypatch.setattr(loop.Run, "save_parameters", late)
     monkeypatch.setattr(checkpoint, "slim", slimming)
     train_seeds(Config(**CONFIG, diagnostics=False), [7, 3], outs, progress=False)
     assert there == [[True, True]] * 2
@@ -150,7 +104,9 @@ def test_a_seed_that_ends_early_ends_all(tmp_path, monkeypatch, error):
 
     def update(self):
         original(self)
-        if self.config.seed == 1 and self.updates == 3:
+        if self.updates == 3:
+            if isinstance(error, Diverged):
+                error.run = self.seeds[1].out
             raise error
 
     monkeypatch.setattr(loop.Run, "update", update)
