@@ -313,7 +313,7 @@ class Replay:
 
         Raises:
             ValueError: something is missing, has another shape or dtype, or contradicts the rest, in one
-                line; nothing but frames is changed then.
+                line; nothing is changed then, unless it is the frames.
         """
         frames = {name for name in arrays if name.startswith("frames_")}
         rng = self._check_snapshot({name: arrays[name] for name in arrays if name not in frames}, numbers)

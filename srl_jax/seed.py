@@ -188,17 +188,20 @@ class Seed:
         self.solved, self.evaluation_due = bool(numbers["solved"]), bool(numbers["evaluation_due"])
 
     def save(self, state: TrainState, env_steps: int, updates: int) -> None:
-        """Writes a checkpoint that can be resumed from: the learner's state, and `parts`."""
+        """Writes a checkpoint that can be resumed from."""
+        full = self.snapshot(state, env_steps)
+        self.saved = self.save_parameters(state.params, env_steps, updates, state=full, base=self.saved)
+        self.saved_position = self.replay.next_position.copy()
+
+    def snapshot(self, state: TrainState, env_steps: int) -> checkpoint.State:
+        """What a run needs beside its parameters to resume: the rest of the learner's state, and `parts`."""
         arrays, numbers = {}, {}
         for part, (snapshot, _) in self.parts(env_steps).items():
             found, numbers[part] = snapshot()
             arrays |= {f"{part}_{name}": x for name, x in found.items()}
         unchanged = self.replay.unchanged_chunks(self.saved_position) if self.saved else ()
-        full = checkpoint.State(
-            {"learner": _learner(state)}, arrays, numbers, frozenset(f"replay_{name}" for name in unchanged)
-        )
-        self.saved = self.save_parameters(state.params, env_steps, updates, state=full, base=self.saved)
-        self.saved_position = self.replay.next_position.copy()
+        unchanged = frozenset(f"replay_{name}" for name in unchanged)
+        return checkpoint.State({"learner": _learner(state)}, arrays, numbers, unchanged)
 
     def save_parameters(self, params: Params, env_steps: int, updates: int, **options: Any) -> Manifest:
         """Writes a checkpoint, without options of parameters alone; see `srl_jax.checkpoint.save`."""

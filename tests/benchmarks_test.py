@@ -284,12 +284,10 @@ def test_every_row_names_what_there_is():
 def tiny(monkeypatch):
     """A run that compiles quickly, in place of every preset."""
     from experiments.benchmarks import jax_side
-    from srl_jax import loop
     from srl_jax.config import Config
 
     config = Config(**SMALL | {"updates_per_step": 0.25, "steps": 1000, "eval_every": 100})
     monkeypatch.setattr(jax_side, "config_of", lambda preset: config)
-    monkeypatch.setattr(loop, "act_and_step", loop.act_and_step)  # the worker's own goes with the test
     return config
 
 

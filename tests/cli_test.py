@@ -34,6 +34,12 @@ class Loop(types.ModuleType):
         super().__init__("srl_jax.loop")
         self.calls = []
         self.resumed = []
+        self.seeds = []
+
+    def train_seeds(self, config, seeds, outs, *, resume, stop):
+        self.seeds.append(seeds)
+        manifests = resume or [None] * len(outs)
+        return [self.train(config, out, resume=m, stop=stop) for out, m in zip(outs, manifests, strict=True)]
 
     def train(self, config, out, *, resume=None, stop):
         assert not stop()
@@ -43,16 +49,7 @@ class Loop(types.ModuleType):
         return types.SimpleNamespace(env_steps=0, updates=0, interrupted=False, pictures={}, recording=None)
 
 
-def test_seeds_get_a_run_directory_each(loop, tmp_path, monkeypatch):
-    lockstep = types.ModuleType("srl_jax.lockstep")
-
-    def train_seeds(config, seeds, outs, *, resume, stop):
-        runs = zip(seeds, outs, resume, strict=True)
-        return [loop.train(config, out, resume=manifest, stop=stop) for _, out, manifest in runs]
-
-    lockstep.train_seeds = train_seeds
-    monkeypatch.setitem(sys.modules, "srl_jax.lockstep", lockstep)
-    monkeypatch.setattr(srl_jax, "lockstep", lockstep, raising=False)
+def test_seeds_get_a_run_directory_each(loop, tmp_path):
     _train("--game=Catch", "--seeds=4,0", f"--out={tmp_path / 'runs'}")
     assert [out.name for _, out in loop.calls] == ["seed4", "seed0"]
     seeds = [Config.load(tmp_path / "runs" / name).seed for name in ("seed4", "seed0")]
@@ -446,23 +443,14 @@ def test_a_run_that_has_ended_says_so(capsys, loop, tmp_path):
     assert len(loop.calls) == 1
 
 
-def test_seeds_go_on_together(capsys, loop, tmp_path, monkeypatch):
-    lockstep = types.ModuleType("srl_jax.lockstep")
-    asked = []
-
-    def train_seeds(config, seeds, outs, *, resume, stop):
-        asked.append((seeds, [m and m.env_steps for m in resume]))
-        return [loop.train(config, out, resume=m, stop=stop) for out, m in zip(outs, resume, strict=True)]
-
-    lockstep.train_seeds = train_seeds
-    monkeypatch.setitem(sys.modules, "srl_jax.lockstep", lockstep)
-    monkeypatch.setattr(srl_jax, "lockstep", lockstep, raising=False)
+def test_seeds_go_on_together(capsys, loop, tmp_path):
     arguments = [*CATCH, f"--out={tmp_path}/runs", "--resume=auto"]
     _train(*arguments, "--seeds=4,0")
     for seed, env_steps in ((4, 100), (0, 100), (4, 200)):
         _checkpoint(tmp_path / "runs" / f"seed{seed}", env_steps)
     _train(*arguments, "--seeds=4,0")
-    assert asked == [([4, 0], [None, None]), ([4, 0], [100, 100])]
+    assert loop.seeds == [[4, 0]] * 2
+    assert [m and m.env_steps for m in loop.resumed] == [None, None, 100, 100]
     line = _refused(capsys, *arguments[1:], "--seeds=4,0,1")
     assert "seed1: no checkpoint there" in line
 

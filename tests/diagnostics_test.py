@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import threading
 from types import SimpleNamespace
 
 import jax
@@ -15,7 +14,7 @@ from srl_jax import checkpoint, envs
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout, measures
 from srl_jax.diagnostics.device import make_functions
-from srl_jax.diagnostics.measure import Diagnostics, check_diagnosed, kept_steps
+from srl_jax.diagnostics.measure import Diagnostics, kept_steps
 from srl_jax.diagnostics.rows import drift_matrix
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
@@ -288,7 +287,7 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     config = Config(**{**SMALL, "diagnostics": True, "eval_every": 60})
     lines = []
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
-    functions = SimpleNamespace(encode=encode, decode={}, others=(), conflict=None, lock=threading.Lock())
+    functions = SimpleNamespace(encode=encode, decode={}, others=(), conflict=None)
     params = {"encoder": {"w": np.float32(0.5)}}
     state = TrainState(params, {}, None, np.int32(0), None)
 
@@ -298,29 +297,21 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     first = make()
     assert first.steps == (0, 60, 120, 180)
     for step in (0, 60):
-        values = first.measure(state, step, None, None)
+        values = first.measure(state, step, None, 1.0, None)
         arguments = {"num_actions": 3, "env_steps": step, "updates": 0, "keep": 0, "folder": "encoders"}
         checkpoint.save(tmp_path, first.parts(params), config, **arguments)
     assert values["diag/drift/steps"] == [0] and values["diag/drift/cka"] == [pytest.approx(1)]
-    assert check_diagnosed(json.loads(json.dumps(values))) == values
-    expected = first.measure(state, 120, None, None)
-    again = make().measure(state, 120, None, None)
+    assert json.loads(json.dumps(values, allow_nan=False)) == values
+    expected = first.measure(state, 120, None, 1.0, None)
+    again = make().measure(state, 120, None, 1.0, None)
     assert {**again, "wall_diag_s": 0} == {**expected, "wall_diag_s": 0} and not lines
     path = tmp_path / "encoders" / "000000000" / "params.msgpack"
     path.write_bytes(path.read_bytes()[:-1])
-    values = make().measure(state, 120, None, None)
+    values = make().measure(state, 120, None, 1.0, None)
     assert values["diag/drift/steps"] == [60] and len(values["diag/drift/cosine"]) == 1
     assert len(lines) == 1 and lines[0].startswith(
         f"drift is measured without the encoder of 0 env steps: {path}"
     )
-
-
-@pytest.mark.parametrize(
-    "values", [[], {"loss": 1.0}, {"diag/x": "1"}, {"diag/x": {}}, {"diag/x": [True]}, {"diag/x": 1e39}]
-)
-def test_what_is_no_diagnostic_is_refused(values):
-    with pytest.raises((TypeError, ValueError)):
-        check_diagnosed(values)
 
 
 # Pictures
@@ -398,14 +389,12 @@ def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
         return np.full(len(z), head["w"]), image, image
 
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
-    functions = SimpleNamespace(
-        encode=encode, decode={"x": decode}, others=(), conflict=None, lock=threading.Lock()
-    )
+    functions = SimpleNamespace(encode=encode, decode={"x": decode}, others=(), conflict=None)
     diagnostics = Diagnostics(config, functions, 1, tmp_path, lines.append)
 
     def measure(step):
         params = {"encoder": {"w": np.float32(0.5)}, "x": {"w": np.float32(step)}}
-        values = diagnostics.measure(TrainState(params, {}, None, np.int32(0), None), step, None, None)
+        values = diagnostics.measure(TrainState(params, {}, None, np.int32(0), None), step, None, 1.0, None)
         arguments = {"num_actions": 3, "env_steps": step, "updates": 0, "keep": 0, "folder": "encoders"}
         checkpoint.save(tmp_path, diagnostics.parts(params), config, **arguments)
         return [values[f"diag/{which}/x"] for which in ("decoder_now", "encoder_now")]

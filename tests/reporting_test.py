@@ -3,7 +3,6 @@
 import json
 import shutil
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,12 +12,7 @@ from srl_jax import reporting
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.optim import NOT_MEASURED
-from srl_jax.reporting import FOLD_EVERY, Means, Report
-
-
-def same(rows):
-    """A fetch for metrics that are on the host as it is."""
-    return rows
+from srl_jax.reporting import Means, Report
 
 
 def one_by_one(rows, name):
@@ -47,40 +41,24 @@ def bits(means):
     return {name: (x.dtype, x.tobytes()) for name, x in means.items()}
 
 
-@given(st.integers(1, 3 * FOLD_EVERY + 7), st.sets(st.integers(0, 3 * FOLD_EVERY)))
-def test_means_are_sums_in_order_wherever_they_are_folded(number, looks):
+@given(st.integers(1, 60), st.sets(st.integers(0, 50)))
+def test_means_are_sums_in_order_wherever_they_are_looked_at(number, looks):
     rows = make_rows(number, seed=number)
-    means = Means(same)
+    means = Means()
     for i, row in enumerate(rows):
         means.add(row)
-        if i in looks:  # a look folds; so does a snapshot, from which another one goes on
+        if i in looks:  # a snapshot, too, from which another one goes on
             assert means.broken() is None
             text = json.dumps(means.snapshot(), allow_nan=False)
-            means = Means(same)
+            means = Means()
             means.restore(json.loads(text))
     names = {name for row in rows for name in row}
     assert bits(means.take()) == bits({name: one_by_one(rows, name) for name in names})
     assert means.take() == {}  # anew
 
 
-def test_means_keep_no_more_than_a_hundred_updates_and_look_no_more_often(monkeypatch):
-    asked = []
-    means = Means(lambda rows: asked.append(len(rows)) or rows)
-    for row in make_rows(5 * FOLD_EVERY + 1):
-        means.add(row)
-        assert len(means._waiting) < FOLD_EVERY
-    assert asked == [FOLD_EVERY] * 5
-
-
-def test_means_of_device_arrays():
-    means = Means(jax.device_get)
-    for x in (1.0, 2.0, 4.5):
-        means.add({"loss/rl": jax.numpy.float32(x)})
-    assert means.take() == {"loss/rl": np.float32(2.5)}
-
-
 def test_a_norm_that_was_not_measured_is_left_out():
-    means = Means(same)
+    means = Means()
     for norm in (NOT_MEASURED, 3.0, NOT_MEASURED, 5.0):
         means.add({"grad_norm/encoder": np.float32(norm), "loss/rl": np.float32(1)})
     assert means.broken() is None
@@ -90,10 +68,10 @@ def test_a_norm_that_was_not_measured_is_left_out():
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-@pytest.mark.parametrize("at", [0, 7, FOLD_EVERY + 3])
+@pytest.mark.parametrize("at", [0, 7])
 def test_a_loss_that_is_not_finite_is_named(bad, at):
-    means = Means(same)
-    for i in range(2 * FOLD_EVERY + 2):
+    means = Means()
+    for i in range(12):
         assert i > at or means.broken() is None
         losses = {"loss/total": 1.0, "loss/a": 1.0, "rl/q": np.inf}
         if i == at:
@@ -108,11 +86,11 @@ def test_a_loss_that_is_not_finite_is_named(bad, at):
 
 
 def test_snapshots_of_means_are_exact():
-    means = Means(same)
+    means = Means()
     values = {"rl/q": np.inf, "rl/nan": np.nan, "rl/low": -np.inf, "loss/rl": 0.1, "loss/a": 1e-45}
     for _ in range(3):
         means.add({name: np.float32(x) for name, x in values.items()})
-    other = Means(same)
+    other = Means()
     other.restore(json.loads(json.dumps(means.snapshot(), allow_nan=False)))
     assert other.snapshot() == means.snapshot()
     assert bits(other.take()) == bits(means.take())
@@ -123,7 +101,7 @@ def test_snapshots_of_means_are_exact():
 
 def report(out):
     out.mkdir(exist_ok=True)
-    return Report(out, 1000, same, progress=False, tensorboard=False)
+    return Report(out, 1000, progress=False, tensorboard=False)
 
 
 def go_on(one, first, last):

@@ -48,28 +48,19 @@ def updates(preset: str, repeats: int, seeds: int = 1) -> list[float]:
     import jax
 
     from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, random_window
-    from srl_jax.agent import make_agent
-    from srl_jax.lockstep import Lockstep
+    from srl_jax.agent import make_agent, over_seeds
 
     config = config_of(preset)
     agent = make_agent(config, NUM_ACTIONS)
     windows = [random_window(config, agent.horizon, i) for i in range(8)]
     count = iter(range(10**9))
-    if seeds == 1:
-        state = [agent.init(jax.random.key(0), None)]
+    device = over_seeds(agent, seeds)
+    state = [device.stack([agent.init(jax.random.key(i), None) for i in range(seeds)])]
 
-        def once() -> None:
-            window = windows[next(count) % len(windows)]
-            state[0], td_error, _ = agent.update(state[0], window, agent.hyper)
-            np.asarray(td_error)
-    else:
-        together = Lockstep(agent, seeds).together  # what the threads would call, without the threads
-        states = [together["init"].call([(jax.random.key(i), None) for i in range(seeds)])]
-
-        def once() -> None:
-            some = [windows[next(count) % len(windows)] for _ in range(seeds)]
-            asked = [(state, window, agent.hyper) for state, window in zip(states[0], some, strict=True)]
-            states[0] = [state for state, _, _ in together["update"].call(asked)]
+    def once() -> None:
+        some = [windows[next(count) % len(windows)] for _ in range(seeds)]
+        state[0], td_error, _ = device.update(state[0], some, agent.hyper)
+        np.asarray(td_error)
 
     return milliseconds(once, repeats)
 
@@ -81,25 +72,20 @@ def whole_run(seconds: float) -> dict[str, float]:
 
     config = config_of(NATURE)
     with tempfile.TemporaryDirectory() as out:
-        run = Run(config, Path(out), progress=False)
-        try:
-            run.start()
+        with Run([config], [Path(out)]) as run:
+            run.begin()
             while run.updates < 20:
                 run.step()
             first, start = run.env_steps, time.perf_counter()
             while time.perf_counter() - start < seconds:
                 run.step()
             rate = (run.env_steps - first) / (time.perf_counter() - start)
-            with run.report, run.evaluator:
-                seconds = []
-                for _ in range(2):  # the first compiles
-                    start = time.perf_counter()
-                    run.start_evaluation(run.now())
-                    run.finish_evaluation()
-                    seconds.append(time.perf_counter() - start)
-        finally:
-            run.env_thread.shutdown()
-            run.env.close()
+            seconds = []
+            for _ in range(2):  # the first compiles
+                start = time.perf_counter()
+                run.start_evaluation()
+                run.finish_evaluation()
+                seconds.append(time.perf_counter() - start)
     evaluation = seconds[1]
     evaluations = config.steps // config.eval_every + 1
     minutes = (config.steps / rate + evaluations * evaluation) / 60

@@ -41,7 +41,8 @@ class Loop:
         from srl_jax import loop
 
         self._acting = []
-        act_and_step = loop.act_and_step
+        self._run = loop.Run([config_of(preset)], [Path()])
+        act_and_step = self._run.act_and_step
 
         def timed_act_and_step(*arguments):
             start = time.perf_counter()
@@ -49,9 +50,8 @@ class Loop:
             self._acting.append(time.perf_counter() - start)
             return result
 
-        loop.act_and_step = timed_act_and_step
-        self._run = loop.Run(config_of(preset), Path(), progress=False)
-        self._run.start()
+        self._run.act_and_step = timed_act_and_step
+        self._run.begin()
         while self._run.updates < WARM_UPDATES:
             self._run.step()
         self._forget()
@@ -89,10 +89,10 @@ class Loop:
         iteration = [timed(run.step) for _ in range(iterations)]
         busy = (time.process_time() - busy) / sum(iteration)
         self._acting.clear()
-        run.due = lambda: 0
+        updates, run.updates = run.updates, 10**12  # as if all had been done
         for _ in range(iterations):
             run.step()
-        del run.due
+        run.updates = updates
         acting = list(self._acting)
         # As many as were left out, so that none is due later.
         update = [timed(run.update) for _ in range(iterations)]
@@ -101,7 +101,8 @@ class Loop:
 
     def _forget(self) -> None:
         """As after a row."""
-        self._run.report.means.take()
+        self._run.fetch()
+        self._run.seeds[0].report.means.take()
         self._acting.clear()
 
 

@@ -29,9 +29,9 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
         preset = dataclasses.replace(preset, buffer_size=1000, encoder="tiny", game="Catch")
     folder = folder / "run"
     folder.mkdir()
-    run = Run(dataclasses.replace(preset, updates_per_step=1e-4), folder, progress=False)
-    run.report.__enter__()
-    run.start()
+    run = Run([dataclasses.replace(preset, updates_per_step=1e-4)], [folder])
+    run.__enter__()
+    run.begin()
 
     def forward(env_steps: int, what: str) -> float:
         began, start = time.monotonic(), run.env_steps
@@ -62,21 +62,23 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
         say(f"cost: checkpoint {i}: {saves[-1]:.2f} s")
         if i < 2:
             forward(every, "between checkpoints")
-    run.report.__exit__(None, None, None)
-    run.env.close()
-    size = sum(path.stat().st_size for path in run.saved.path.iterdir())
+    run.__exit__(None, None, None)
+    (seed,) = run.seeds
+    size = sum(path.stat().st_size for path in seed.saved.path.iterdir())
     began = time.monotonic()
     manifest = checkpoint.newest_good(folder, say)
     verified = time.monotonic() - began
-    again = Run(preset, folder, progress=False, resume=manifest)
+    again = Run([preset], [folder], resume=[manifest])
     seconds = time.monotonic() - began
-    same = bool((again.replay.frames == run.replay.frames).all()) and again.env_steps == run.env_steps
-    again.env.close()
+    (other,) = again.seeds
+    same = bool((other.replay.frames == seed.replay.frames).all()) and again.env_steps == run.env_steps
+    again.env_threads.shutdown()
+    other.close()
     save = float(np.median(saves[1:]))
     share = save / (save + every / rate)
     costs = f"{save:.2f} s every {every:,} env steps at {rate:.0f} a second"
     told = f"{costs}: {100 * share:.2f} %; {size / 1e6:.0f} MB"
-    resumed = f"{seconds:.1f} s, {verified:.1f} of them to check the sums; {len(again.replay):,} transitions"
+    resumed = f"{seconds:.1f} s, {verified:.1f} of them to check the sums; {len(other.replay):,} transitions"
     return [
         Count("a checkpoint costs under 2 % of a run's time", 1, int(share >= SHARE and not short), told),
         Count("going on takes under 30 s", 1, int(seconds >= SECONDS or not same), resumed),

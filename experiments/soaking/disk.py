@@ -15,7 +15,7 @@ from unittest import mock
 
 from experiments.soaking import Count, Say, kills
 from experiments.soaking.small import stopped_run
-from srl_jax import checkpoint, snapshot
+from srl_jax import checkpoint, replay
 from srl_jax.errors import ConfigError, SaveError
 
 STEPS_BETWEEN = 30
@@ -76,7 +76,7 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
 
 def in_turn(folder: Path, short: bool, say: Say) -> Count:
     """Every operation of one checkpoint."""
-    with mock.patch.object(snapshot, "CHUNK_BYTES", 200_000):  # so that there are several
+    with mock.patch.object(replay, "CHUNK_BYTES", 200_000):  # so that there are several
         run = stopped_run(folder, at=400)
     kept = {path.name: contents(path) for path in checkpoint_folders(folder)}
     state = run_state(run)
@@ -113,23 +113,17 @@ def in_turn(folder: Path, short: bool, say: Say) -> Count:
 
 def run_state(run) -> tuple:
     """What there is to save, of a run that has been stopped."""
-    with mock.patch.object(type(run.report), "snapshot", lambda report: {}):
-        state = snapshot.take(run)
+    (seed,) = run.seeds
+    with mock.patch.object(type(seed.report), "snapshot", lambda report: {}):
+        state = seed.snapshot(run.state, run.env_steps)
     return state._replace(unchanged=frozenset(sorted(state.unchanged)[::2]))  # some linked, some written
 
 
 def save(run, state) -> None:
     """A checkpoint of some steps later than the run's."""
-    checkpoint.save(
-        run.out,
-        run.state.params,
-        run.config,
-        num_actions=run.num_actions,
-        env_steps=run.env_steps + STEPS_BETWEEN,
-        updates=run.updates,
-        state=state,
-        base=run.saved,
-    )
+    (seed,) = run.seeds
+    later = run.env_steps + STEPS_BETWEEN
+    seed.save_parameters(run.state.params, later, run.updates, state=state, base=seed.saved)
 
 
 def checkpoint_folders(run: Path) -> list[Path]:

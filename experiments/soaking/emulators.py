@@ -6,6 +6,8 @@ The last of these is in `snapshots.py`.
 from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from unittest import mock
 
 import gymnasium
 import numpy as np
@@ -13,8 +15,8 @@ from gymnasium.wrappers import AtariPreprocessing
 
 from experiments.soaking import Count, Say
 from experiments.soaking.snapshots import NOOP_MAX, Lines, out_of_snapshots
-from srl_jax import envs
-from srl_jax.actor import Policy, random_policy, seed_for
+from srl_jax import envs, loop
+from srl_jax.actor import seed_for
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.envs.atari import COUNTERS
@@ -308,35 +310,29 @@ class Recorded(Run):
     """
 
     def __init__(self, config: Config, folder: Path, steps: int, options: dict):
-        self._steps, self._options = steps, options
         self.wrong_stacks = 0
         # Parameters would only have to be compiled and drawn; nobody asks for them.
-        agent = make_agent(config, num_actions=18)._replace(init=lambda *_: None)
-        super().__init__(config, folder, progress=False, agent=agent)
+        agent = make_agent(config, num_actions=18)._replace(init=lambda *_: SimpleNamespace(params=None))
 
-    def make_env(self, purpose: str, num_envs: int) -> Recorder:
-        """Environments of the config's game and protocol, recorded."""
-        env = envs.make(
-            self.config.game,
-            num_envs=num_envs,
-            seed=seed_for(self.config.seed, purpose, "environments"),
-            frame_size=self.config.frame_size,
-            noop_max=self.config.noop_max,
-            **self._options,
-        )
-        return Recorder(env, self._steps)
+        def make_env(config: Config, purpose: str, num_envs: int) -> Recorder:
+            env = envs.make(
+                config.game,
+                num_envs=num_envs,
+                seed=seed_for(config.seed, purpose, "environments"),
+                frame_size=config.frame_size,
+                noop_max=config.noop_max,
+                **options,
+            )
+            return Recorder(env, steps)
 
-    @property
-    def policy(self) -> Policy:
-        """Random actions; looks at what it is shown."""
+        with mock.patch.object(loop, "make_env", make_env):
+            super().__init__([config], [folder], agent=agent)
 
-        act = random_policy(self.num_actions, self.random)
-
-        def policy(stacks, step, epsilon):
-            self.wrong_stacks += np.count_nonzero(~self.env.right_stacks(stacks))
-            return act(stacks, step, epsilon)
-
-        return policy
+    def act_and_step(self, params, frames, step, epsilon) -> list:
+        """Random actions; looks at what the policy is shown."""
+        (seed,), (stacks,) = self.seeds, frames
+        self.wrong_stacks += np.count_nonzero(~seed.env.right_stacks(stacks))
+        return [seed.step_env(seed.policy(stacks, step, epsilon))]
 
 
 def through_the_loop(short: bool, folder: Path, say: Say) -> list[Count]:
@@ -365,11 +361,9 @@ def through_the_loop(short: bool, folder: Path, say: Say) -> list[Count]:
                 updates_per_step=1e-12,
                 seed=index,
             )
-            run = Recorded(config, folder, steps, options)
-            with run.env_thread, run.evaluator:
+            with Recorded(config, folder, steps, options) as run:
                 done = index * total
                 drive(run, steps, counts, lambda env_steps: progress.update(done + env_steps, game=game))  # noqa: B023
-                run.env.close()
     detail = f"{len(games)} games; {counts['ends']:,} episodes, {counts['cuts']:,} of them cut"
     return [
         Count(
@@ -387,7 +381,8 @@ def through_the_loop(short: bool, folder: Path, say: Say) -> list[Count]:
 
 def drive(run: Recorded, steps: int, counts: Counter[str], say_how_far: Callable[[int], None]) -> None:
     """Runs so many steps of all environments, and adds up what was counted."""
-    record, replay, stack, gamma = run.env, run.replay, run.config.frame_stack, run.config.gamma
+    record, replay = run.seeds[0].env, run.seeds[0].replay
+    stack, gamma = run.config.frame_stack, run.config.gamma
     rng = np.random.default_rng(run.config.seed)
     seen = np.zeros(record.actions.shape, bool)
 
@@ -398,7 +393,7 @@ def drive(run: Recorded, steps: int, counts: Counter[str], say_how_far: Callable
         rows, streams = np.divmod(indices, record.num_envs)
         seen[streams, rows] = True
 
-    run.start()
+    run.begin()
     for step in range(1, steps + 1):
         run.step()
         if len(replay):

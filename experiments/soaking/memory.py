@@ -30,7 +30,7 @@ def soak(short: bool, folder: Path, say: Say) -> list[Count]:
     folder = folder / "run"
     folder.mkdir()
     values = {"steps": steps, "log_every": steps, "checkpoint_every": steps // 6, "eval_every": steps // 5}
-    run = Run(config(updates_per_step=0.9, **values), folder, progress=False)
+    run = Run([config(updates_per_step=0.9, **values)], [folder])
     seen: list[tuple[int, int]] = []
     step = run.step
     began = time.monotonic()

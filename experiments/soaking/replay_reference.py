@@ -7,9 +7,11 @@ up slowly. Nothing here is an `assert`, so that `python -O` checks as much.
 import itertools
 import json
 from bisect import bisect_right
+from unittest import mock
 
 import numpy as np
 
+from srl_jax import replay
 from srl_jax.replay import Replay
 
 GAMMA = 0.5  # powers of it are exact
@@ -147,7 +149,7 @@ class Driver:
         self.reference = Reference(num_streams, slots, stack, horizon, alpha, seed)
         self.waiting = set(range(num_streams))
         self.count = itertools.count(1)
-        self.disk = np.zeros_like(self.replay.frames)
+        self.disk = {}
         self.written = self.replay.next_position.copy()  # what `disk` is of
 
     def new_frames(self, n):
@@ -212,15 +214,19 @@ class Driver:
 
     def restore(self):
         """Goes on with a new replay, made from bytes and JSON; frames are kept as a checkpoint keeps them."""
-        changed = self.replay.changed_slots(self.written)
-        self.disk[:, changed] = self.replay.frames[:, changed]
+        with mock.patch.object(replay, "CHUNK_BYTES", 60):  # so that there are several
+            arrays, numbers = self.replay.snapshot()
+            unchanged = self.replay.unchanged_chunks(self.written)
+            self._restore(arrays, numbers, unchanged)
+
+    def _restore(self, arrays, numbers, unchanged):
+        for name, array in arrays.items():
+            if name not in unchanged:
+                self.disk[name] = array.tobytes(), array.dtype.str, array.shape
         self.written = self.replay.next_position.copy()
-        arrays, numbers = self.replay.snapshot()
-        data = {name: (array.tobytes(), array.dtype.str, array.shape) for name, array in arrays.items()}
+        data = {name: self.disk[name] for name in arrays}
         text = json.dumps(numbers)
         self.twin, self.replay = self.replay, Replay(**self.options)
-        filled = self.twin.filled_slots()
-        self.replay.frames[:, :filled] = self.disk[:, :filled]
         self.replay.restore(
             {name: np.frombuffer(d, dtype).reshape(shape) for name, (d, dtype, shape) in data.items()},
             json.loads(text),

@@ -38,7 +38,7 @@ def stopped_run(out: Path, at: int, **values: Any) -> Any:
     from srl_jax.loop import Run
 
     out.mkdir(parents=True)
-    run = Run(config(**values), out, progress=False)
+    run = Run([config(**values)], [out])
     run.stop = lambda: run.env_steps >= at
     run.train()
     return run

@@ -23,26 +23,25 @@ from experiments import train
 
 
 def digest(run: Any) -> dict[str, str]:
-    """Sums of parameters, slow copies, optimizer, keys, replay with priorities, generators, environments."""
+    """Sums of parameters, slow copies, optimizer, keys, and of all that the seeds have on the host."""
     import jax
 
     def of(array: Any) -> str:
         return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
 
-    state = run.agent.export(run.state)
-    state = state._replace(key=jax.random.key_data(state.key))
-    sums = {f"state{jax.tree_util.keystr(k)}": of(x) for k, x in jax.tree_util.tree_leaves_with_path(state)}
-    arrays, numbers = run.replay.snapshot()
-    sums |= {f"replay {name}": of(x) for name, x in arrays.items()}
-    sums |= {f"replay {name}": json.dumps(x) for name, x in numbers.items()}
-    sums |= {f"environments {name}": of(x) for name, x in run.env.snapshot().items()}
-    return sums | {
-        "replay frames": of(run.replay.frames),
-        "stacks": of(run.stacks.frames),
-        "scores": json.dumps(run.score.tolist()),
-        "random policy": json.dumps(run.random.bit_generator.state),
-        "counts": json.dumps([run.env_steps, run.updates]),
-    }
+    sums = {"counts": json.dumps([run.env_steps, run.updates])}
+    for i, seed in enumerate(run.seeds):
+        state = run.device.part(run.state, i)
+        state = state._replace(key=jax.random.key_data(state.key))
+        leaves = jax.tree_util.tree_leaves_with_path(state)
+        sums |= {f"seed {i} state{jax.tree_util.keystr(k)}": of(x) for k, x in leaves}
+        for name, (snapshot, _) in seed.parts(run.env_steps).items():
+            if name != "report":  # whose rows are compared
+                arrays, numbers = snapshot()
+                sums |= {f"seed {i} {name} {key}": of(x) for key, x in arrays.items()}
+                numbers = {key: x for key, x in (numbers or {}).items() if key != "evaluation_due"}
+                sums[f"seed {i} {name}"] = json.dumps(numbers)
+    return sums
 
 
 _CALLS, _KINDS = ("os.replace", "os.fsync", "os.link", "rmtree"), ("npy", "msgpack", "json")
@@ -112,9 +111,9 @@ def main(arguments: list[str]) -> int:
     train.define_flags(values)
     config_flags.parse(["train", *rest], values)
 
-    from srl_jax import loop, snapshot
+    from srl_jax import loop, replay
 
-    snapshot.CHUNK_BYTES = 1 << 20  # so that there are several in a small buffer
+    replay.CHUNK_BYTES = 1 << 20  # so that there are several in a small buffer
 
     class Victim(loop.Run):
         def run(self) -> bool:
