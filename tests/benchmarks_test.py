@@ -301,8 +301,8 @@ def test_the_timed_loop_does_the_updates_that_are_due(tiny):
     assert (reply["env_steps"], reply["updates"]) == (60, 15) and reply["seconds"] > 0
     parts = timed.parts(3)
     assert [len(parts[name]) for name in ("iteration", "acting", "update", "busy")] == [3, 3, 3, 1]
-    assert timed._run.report.means.take() == {}  # nothing is kept from one request to the next
-    timed._run.env_thread.shutdown()
+    assert timed._run.seeds[0].report.means.take() == {}  # nothing is kept from one request to the next
+    timed._run.env_threads.shutdown()
 
 
 def test_a_projected_run_has_the_evaluations_of_a_whole_one(tiny, monkeypatch):
