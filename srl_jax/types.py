@@ -53,14 +53,17 @@ class Encoder(NamedTuple):
         features: D.
         observation_shape: (H, W, S).
         make_decoder: (extra_inputs: int = 0) -> Decoder; its input is the latent joined with that many
-            more numbers (a one-hot action, say).
+            more numbers (a one-hot action, say). None where there is no decoder.
+        map_shape: (H', W', C'), the last convolution's map of one observation before it is flattened; None
+            where there is none, or it is not known.
     """
 
     init: Callable
     apply: Callable
     features: int
     observation_shape: tuple
-    make_decoder: Callable
+    make_decoder: Callable | None
+    map_shape: tuple | None = None
 
 
 class Decoder(NamedTuple):
@@ -70,11 +73,34 @@ class Decoder(NamedTuple):
     apply: Callable
 
 
-class Context(NamedTuple):
-    """What a factory may know of the run that it is built for: the encoder and the number of actions."""
+def no_decoder(extra_inputs: int = 0) -> Decoder:
+    """`Context.make_decoder` where there is no decoder.
 
-    encoder: Encoder
+    Raises:
+        ValueError: always; an objective that asks for a decoder cannot be built.
+    """
+    raise ValueError("it needs a decoder, and the encoder has none")
+
+
+class Context(NamedTuple):
+    """What a factory may know of the run that it is built for: what it stands on.
+
+    Attributes:
+        features: D, the latent's size.
+        num_actions: A.
+        make_decoder: as of `Encoder`; raises ValueError where there is no decoder.
+        map_shape: as of `Encoder`.
+    """
+
+    features: int
     num_actions: int
+    make_decoder: Callable = no_decoder
+    map_shape: tuple | None = None
+
+    @classmethod
+    def of(cls, encoder: Encoder, num_actions: int) -> "Context":
+        """The context of objectives over an encoder."""
+        return cls(encoder.features, num_actions, encoder.make_decoder or no_decoder, encoder.map_shape)
 
 
 class Latents(NamedTuple):

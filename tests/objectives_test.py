@@ -22,7 +22,7 @@ from srl_jax.types import Latents, Objective, TrainState, Window
 from srl_jax.update import Hyper, make_init, make_latents, make_update, periodic, shut
 from srl_jax.window import image
 from tests import helpers
-from tests.helpers import SIZE, STACK, jit, make_context, make_window
+from tests.helpers import SIZE, STACK, jit, make_context, make_encoder, make_window
 
 BATCH = 4
 
@@ -123,13 +123,13 @@ class Row(NamedTuple):
 
 @functools.cache
 def build(kind: str, name: str) -> Row:
-    context = make_context()
+    encoder, context = make_encoder(), make_context()
     factory = {"objectives": objectives, "rl": rl}[kind].REGISTRY[name]
     options = {"hidden": 16} if "hidden" in specs.option_defaults(factory) else {}
     objective = factory(context, **options)
     if kind == "rl":
         name, objective = RL, objective.objective._replace(slow=periodic(1000))
-    terms, encoder = {name: objective}, context.encoder
+    terms = {name: objective}
     optimizer = make_optimizer(terms, adam_eps=1e-4)
     init = make_init(encoder, terms, MODES["joint"], optimizer)
     state = helpers.random_state(init)

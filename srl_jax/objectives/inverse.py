@@ -36,7 +36,7 @@ def inverse(context: Context, *, weight: float = 1.0, hidden: int = 256) -> Obje
     """
     check_size("hidden", hidden)
     network = InverseHead(context.num_actions, hidden)
-    z = jnp.zeros((1, context.encoder.features))
+    z = jnp.zeros((1, context.features))
 
     def loss(head, slow_head, latents: Latents, window: Window, key):
         logits = network.apply({"params": head}, latents.online(0), latents.online(1))
