@@ -107,7 +107,15 @@ class Latents(NamedTuple):
     """The latents of a window's observations under the online and the slow encoder.
 
     `online(k)` and `slow(k)` give float32 [B, D] for offset k, an int or an int32 array [B] (one offset
-    per row). The same offset is encoded at most once per trace, however many objectives ask for it.
+    per row). For a list or a tuple of K offsets they give float32 [K, B, D], by one call of the encoder with
+    K * B rows.
+
+    The same offset is encoded at most once per trace, however many objectives ask for it. Offsets are the
+    same if they are equal ints, one and the same array, or arrays of equal numbers where these are known
+    when they are traced, as those of numpy arrays are. The same list is encoded once, too, and so is an
+    offset that a list holds twice. But an offset alone and the same offset in a list are both encoded, and
+    so are the offsets that two different lists share: what one objective asks for never changes the
+    roundings of what another one sees.
     """
 
     online: Callable

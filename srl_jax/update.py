@@ -2,11 +2,12 @@
 
 import math
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from srl_jax.augment import random_shift
@@ -43,6 +44,25 @@ def periodic(every: int) -> Callable:
         return jax.lax.cond(step % every == 0, lambda: new, lambda: old)
 
     follow.every = every
+    return follow
+
+
+def ema(tau: float) -> Callable:
+    """The rule of a slow copy that is an exponential moving average, moved in every update.
+
+    `slow = tau * slow + (1 - tau) * online`: tau is the share of the copy that stays. Near 1 it follows
+    slowly, at 0 it is the original as the same update left it. BYOL (Grill et al. 2020, equation 1) and SPR
+    (Schwarzer et al. 2021, section 2.2) mean this by tau; soft actor-critic means 1 - tau.
+
+    Raises:
+        ValueError: tau is not in [0, 1); at 1 the copy would stand still.
+    """
+    if not 0 <= tau < 1:
+        raise ValueError(f"tau must be at least 0 and below 1, not {tau}")
+
+    def follow(new: Params, old: Params, step: Array) -> Params:
+        return jax.tree.map(lambda n, o: tau * o + (1 - tau) * n, new, old)
+
     return follow
 
 
@@ -358,16 +378,36 @@ def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window)
 
 
 def encoded(encoder: Encoder, params: Params, window: Window) -> Callable:
-    """offset -> latents; encodes an offset at most once for each object given as offset."""
+    """offset -> latents, list of offsets -> latents of each: what `Latents` says of one encoder."""
     known = {}
 
-    def latent(k: int | Array) -> Array:
-        index = k if isinstance(k, int) else id(k)
-        if index not in known:  # the offset is kept too, so that its id stays its own
-            known[index] = (encoder.apply(params, observation(window, k)), k)
-        return known[index][0]
+    def latent(k: int | Array | Sequence[int | Array]) -> Array:
+        several = isinstance(k, list | tuple)
+        offsets = {_identity(offset): offset for offset in (k if several else [k])}
+        index = several, *offsets
+        if index not in known:  # the offsets are kept too, so that their ids stay their own
+            views = [observation(window, offset) for offset in offsets.values()]
+            z = encoder.apply(params, jnp.concatenate(views) if several else views[0])
+            known[index] = z, offsets
+        z, _ = known[index]
+        if not several:
+            return z
+        z = z.reshape(len(offsets), -1, *z.shape[1:])
+        if len(offsets) == len(k):
+            return z
+        places = list(offsets)
+        return z[np.array([places.index(_identity(offset)) for offset in k])]
 
     return latent
+
+
+def _identity(offset: int | Array) -> Hashable:
+    """What two offsets that are known to be equal have in common."""
+    if isinstance(offset, int):
+        return offset
+    if isinstance(offset, jax.core.Tracer):
+        return "tracer", id(offset)
+    return np.shape(offset), np.asarray(offset).tobytes()
 
 
 def frozen(latent: Callable) -> Callable:
