@@ -2,7 +2,7 @@
 
 import math
 import zlib
-from collections.abc import Callable, Collection, Hashable, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
@@ -13,7 +13,7 @@ import optax
 from srl_jax.augment import random_shift
 from srl_jax.modes import ENCODER_OPTIMIZERS, Mode
 from srl_jax.optim import ENCODER, ENCODER_SRL, RL, Optimizer, measured, real_copy
-from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
+from srl_jax.types import Array, Encoder, Latents, Objective, Offsets, Params, TrainState, Window
 from srl_jax.window import observation, stack_last
 
 NORM_EVERY = 10
@@ -32,7 +32,7 @@ class Hyper(NamedTuple):
     learning_rates: dict[str, Array]
 
 
-def named_key(key: Array, name: str) -> Array:
+def named_key(key: jax.Array, name: str) -> jax.Array:
     """A key that depends on a name alone, so that enabling one objective never changes another's noise."""
     return jax.random.fold_in(key, zlib.crc32(name.encode()))
 
@@ -377,13 +377,15 @@ def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window)
     return Latents(encoded(encoder, params, window), frozen(encoded(encoder, slow, window)))
 
 
-def encoded(encoder: Encoder, params: Params, window: Window) -> Callable:
+def encoded(encoder: Encoder, params: Params, window: Window) -> Callable[[Offsets], jax.Array]:
     """offset -> latents, list of offsets -> latents of each: what `Latents` says of one encoder."""
-    known = {}
+    known: dict[Hashable, tuple[jax.Array, Mapping[Hashable, int | Array]]] = {}
 
-    def latent(k: int | Array | Sequence[int | Array]) -> Array:
-        several = isinstance(k, list | tuple)
-        offsets = {_identity(offset): offset for offset in (k if several else [k])}
+    def latent(k: Offsets) -> jax.Array:
+        several = isinstance(k, Sequence)
+        asked = k if isinstance(k, Sequence) else (k,)
+        identities = [_identity(offset) for offset in asked]
+        offsets = dict(zip(identities, asked, strict=True))
         index = several, *offsets
         if index not in known:  # the offsets are kept too, so that their ids stay their own
             views = [observation(window, offset) for offset in offsets.values()]
@@ -393,10 +395,10 @@ def encoded(encoder: Encoder, params: Params, window: Window) -> Callable:
         if not several:
             return z
         z = z.reshape(len(offsets), -1, *z.shape[1:])
-        if len(offsets) == len(k):
+        if len(offsets) == len(identities):
             return z
         places = list(offsets)
-        return z[np.array([places.index(_identity(offset)) for offset in k])]
+        return z[np.array([places.index(identity) for identity in identities])]
 
     return latent
 
@@ -410,7 +412,7 @@ def _identity(offset: int | Array) -> Hashable:
     return np.shape(offset), np.asarray(offset).tobytes()
 
 
-def frozen(latent: Callable) -> Callable:
+def frozen(latent: Callable[[Offsets], jax.Array]) -> Callable[[Offsets], jax.Array]:
     """The same latents without gradient."""
     return lambda k: jax.lax.stop_gradient(latent(k))
 

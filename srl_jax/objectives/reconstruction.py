@@ -7,7 +7,7 @@ from srl_jax.types import Array, Context, Latents, Objective, Window
 from srl_jax.window import image
 
 
-def mean_squared_error(output: Array, target: Array) -> Array:
+def mean_squared_error(output: Array, target: Array) -> jax.Array:
     """The squared error of an image, averaged over all its pixels and channels.
 
     Args:

@@ -3,7 +3,7 @@
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -12,9 +12,15 @@ from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.losses import n_step as n_step_view
 from srl_jax.rl.values import Values, categorical, normal_logits, quantile, scalar
 from srl_jax.specs import check_size, option_defaults
-from srl_jax.types import Context, Latents, Objective, Window
+from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 
 __all__ = ["REGISTRY", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
+
+
+class QFunction(Protocol):
+    """The type of `Algorithm.q_values`."""
+
+    def __call__(self, head: Params, latents: Array, key: jax.Array | None = None) -> Array: ...
 
 
 class Algorithm(NamedTuple):
@@ -28,7 +34,7 @@ class Algorithm(NamedTuple):
     """
 
     objective: Objective
-    q_values: Callable
+    q_values: QFunction
     alpha: float
 
 
@@ -72,22 +78,24 @@ def q_learner(
     def init(key):
         return network.init(key, jnp.zeros((1, context.features), jnp.float32), None)["params"]
 
-    def q_values(head, latents, key=None):
+    def apply(head: Params, latents: Array, noise: Array | None) -> Any:
+        return network.apply({"params": head}, latents, noise)
+
+    def q_values(head: Params, latents: Array, key: jax.Array | None = None) -> Array:
         noise = None if key is None or not noisy else network.draw_noise(key, 1, context.features)[0]
-        return values.expected(network.apply({"params": head}, latents, noise))
+        return values.expected(apply(head, latents, noise))
 
     def loss(head, slow_head, latents: Latents, window: Window, key):
         r_t, discount_t, offset = n_step_view(window.rewards, window.discounts, window.valid, n_step)
         a_tm1 = window.actions[:, 0]
         # The online network has one draw of noise for both observations, and so the same weights.
         online, slow = network.draw_noise(key, 2, context.features) if noisy else (None, None)
-        out_tm1 = network.apply({"params": head}, latents.online(0), online)
-        slow_t = network.apply({"params": slow_head}, latents.slow(offset), slow)
-        slow_t = jax.lax.stop_gradient(slow_t)
+        out_tm1 = apply(head, latents.online(0), online)
+        slow_t = jax.lax.stop_gradient(apply(slow_head, latents.slow(offset), slow))
         if double:
             z_t = jax.lax.stop_gradient(latents.online(offset))
             frozen = jax.lax.stop_gradient(head)
-            selector_t = values.expected(network.apply({"params": frozen}, z_t, online))
+            selector_t = values.expected(apply(frozen, z_t, online))
         else:
             selector_t = values.expected(slow_t)
         losses, td_error = jax.vmap(values.loss)(out_tm1, a_tm1, r_t, discount_t, slow_t, selector_t)
@@ -153,7 +161,7 @@ def rainbow(
     )
 
 
-def q_learner_of(kind: Callable[..., Values], **defaults: bool) -> Callable[..., Algorithm]:
+def q_learner_of(kind: Callable[..., Values], **defaults: Any) -> Callable[..., Algorithm]:
     """A row: `q_learner` of a kind of value; its options are those of both, and no others.
 
     Args:
@@ -163,11 +171,11 @@ def q_learner_of(kind: Callable[..., Values], **defaults: bool) -> Callable[...,
     context, _, *parts = inspect.signature(q_learner).parameters.values()
     own = inspect.signature(kind).parameters
 
-    def row(context: Context, **options) -> Algorithm:
+    def row(context: Context, **options: Any) -> Algorithm:
         values = kind(**{name: options.pop(name) for name in own if name in options})
         return q_learner(context, values, **options)
 
-    row.__signature__ = inspect.Signature([context, *parts, *own.values()])
+    row.__dict__["__signature__"] = inspect.Signature([context, *parts, *own.values()])
     return partial(row, **defaults)
 
 

@@ -36,7 +36,7 @@ class QNetwork(nn.Module):
             noise: a row of what `noise` draws; None acts with the means.
         """
         lengths = self._noise_lengths(z.shape[-1])
-        parts = [None] * len(lengths)
+        parts: list = [None] * len(lengths)
         if self.noisy and noise is not None:
             parts = jnp.split(noise, np.cumsum(lengths)[:-1].tolist())
 

@@ -37,7 +37,7 @@ def q_learning(
     return target - q_tm1[a_tm1]
 
 
-def huber(td_error: Array, delta: float = 1.0) -> Array:
+def huber(td_error: Array, delta: float = 1.0) -> jax.Array:
     """The Huber loss of a temporal-difference error: quadratic within delta, linear beyond (any shape)."""
     size = jnp.abs(td_error)
     quadratic = jnp.minimum(size, delta)
@@ -52,7 +52,7 @@ def categorical_q_learning(
     discount_t: Array,
     q_logits_slow_t: Array,
     q_selector_t: Array,
-) -> Array:
+) -> jax.Array:
     """The cross-entropy of categorical (double) Q-learning, C51.
 
     The slow distribution of the selected action is shifted and scaled by the return and the discount,
@@ -82,7 +82,7 @@ def categorical_q_learning(
 
 def categorical_target(
     atoms: Array, r_t: Array, discount_t: Array, q_logits_slow_t: Array, q_selector_t: Array
-) -> Array:
+) -> jax.Array:
     """What `categorical_q_learning` compares with; arguments as there. float32 [M], no gradient."""
     probs_t = jax.nn.softmax(q_logits_slow_t[jnp.argmax(q_selector_t)])
     target = categorical_projection(r_t + discount_t * atoms, probs_t, atoms)
@@ -97,7 +97,7 @@ def quantile_q_learning(
     q_quantiles_slow_t: Array,
     q_selector_t: Array,
     kappa: float = 1.0,
-) -> Array:
+) -> jax.Array:
     """The quantile Huber loss of quantile (double) Q-learning, QR-DQN.
 
     Output i is the online estimate of the return's quantile at (i + 0.5) / M, the midpoint of the i-th of M
@@ -129,12 +129,12 @@ def quantile_q_learning(
     return jnp.sum(jnp.mean(weight * huber(error, kappa), 1))
 
 
-def entropy(probs: Array) -> Array:
+def entropy(probs: Array) -> jax.Array:
     """The entropy of a distribution, float32 [M] -> [], in nats; `0 log 0` is 0."""
     return -jnp.sum(probs * jnp.log(jnp.maximum(probs, 1e-30)))
 
 
-def categorical_projection(support: Array, probs: Array, atoms: Array) -> Array:
+def categorical_projection(support: Array, probs: Array, atoms: Array) -> jax.Array:
     """Moves a distribution onto other atoms, each mass split between its two neighbours by distance.
 
     Args:
@@ -152,7 +152,7 @@ def categorical_projection(support: Array, probs: Array, atoms: Array) -> Array:
     return jnp.clip(1.0 - distance, 0.0, 1.0) @ probs
 
 
-def n_step(rewards: Array, discounts: Array, valid: Array, n: int):
+def n_step(rewards: Array, discounts: Array, valid: Array, n: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The n-step view of a window: what the return is, and where and with what discount to bootstrap.
 
     Sums rewards until n steps are done, a discount is 0 (a terminal state) or the episode is over. After a

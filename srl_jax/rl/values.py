@@ -20,6 +20,7 @@ from srl_jax.rl.losses import (
     quantile_q_learning,
 )
 from srl_jax.specs import check_size, choices_text
+from srl_jax.types import Array
 
 PRIORITIES = ("cross_entropy", "kl")
 
@@ -38,8 +39,8 @@ class Values(NamedTuple):
     """
 
     outputs: int
-    expected: Callable
-    loss: Callable
+    expected: Callable[[Array], Array]
+    loss: Callable[[Array, Array, Array, Array, Array, Array], tuple[jax.Array, jax.Array]]
     prior: tuple[float, ...] | None = None
 
 
@@ -49,7 +50,7 @@ def scalar() -> Values:
     Priorities are made of the temporal-difference error.
     """
 
-    def expected(outputs):
+    def expected(outputs: Array) -> Array:
         return outputs[..., 0]
 
     def loss(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t):
@@ -86,7 +87,7 @@ def categorical(
         raise ValueError(f"priority: {choices_text(priority, PRIORITIES)}")
     support = make_support(v_min, v_max, atoms)
 
-    def expected(outputs):
+    def expected(outputs: Array) -> Array:
         return jax.nn.softmax(outputs) @ support
 
     def loss(out_tm1, a_tm1, *bootstrap):
@@ -113,7 +114,7 @@ def quantile(*, quantiles: int = 200) -> Values:
     """
     check_size("quantiles", quantiles)
 
-    def expected(outputs):
+    def expected(outputs: Array) -> Array:
         return jnp.mean(outputs, -1)
 
     def loss(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t):
