@@ -18,7 +18,7 @@ from srl_jax.objectives.inverse import action_cross_entropy
 from srl_jax.objectives.latent_l2 import half_squared_norm
 from srl_jax.objectives.reconstruction import mean_squared_error
 from srl_jax.optim import RL, make_optimizer
-from srl_jax.types import Latents, Objective, TrainState, Window
+from srl_jax.types import Context, Latents, Objective, TrainState, Window
 from srl_jax.update import Hyper, make_init, make_latents, make_update, periodic, shut
 from srl_jax.window import image
 from tests import helpers
@@ -92,6 +92,22 @@ def test_default_weights_are_the_thesis_ones():
     assert weights["reconstruction"] == weights["forward_pixels"] == 1.0
     assert weights["latent_l2"] == 1e-6
     assert objectives.inverse(make_context(), weight=0.25).weight == 0.25
+
+
+@pytest.mark.parametrize("name", ["reconstruction", "forward_pixels"])
+def test_a_decoder_that_is_not_there_is_told_in_one_line(name):
+    spec = specs.parse(name, objectives.REGISTRY, "objective")
+    message = f"^--objective={name}: it needs a decoder, and the encoder has none$"
+    bare = Context.of(make_encoder()._replace(make_decoder=None), helpers.NUM_ACTIONS)
+    for context in (Context(features=8, num_actions=3), bare):
+        with pytest.raises(specs.SpecError, match=message):
+            specs.build(spec, objectives.REGISTRY, context)
+
+
+def test_a_context_is_what_the_encoder_says():
+    encoder = make_encoder(features=5)
+    assert Context.of(encoder, 7) == (5, 7, encoder.make_decoder, None)
+    assert Context.of(encoder._replace(map_shape=(2, 3, 4)), 7).map_shape == (2, 3, 4)
 
 
 # Every row
