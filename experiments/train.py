@@ -122,7 +122,7 @@ def resolved(config: Config) -> Config:
     # knows. The number of actions is not known yet; any will do for that.
     shape = (config.frame_size, config.frame_size, config.frame_stack)
     encoder = build(parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
-    context = Context(encoder, num_actions=18)
+    context = Context.of(encoder, num_actions=18)
     build(parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
     for text in config.objectives:
         objective = parse(text, objectives.REGISTRY, "objective")

@@ -121,7 +121,7 @@ def make_agent(config: Config, num_actions: int) -> Agent:
     mode = MODES[config.mode]
     shape = (config.frame_size, config.frame_size, config.frame_stack)
     encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
-    context = Context(encoder, num_actions)
+    context = Context.of(encoder, num_actions)
     algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
     terms: dict[str, Objective] = {}
     if mode.rl:

@@ -5,13 +5,22 @@ height and width, D for the latent's size. Nothing here imports jax, so that a c
 checked without paying for it.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from __future__ import annotations
 
-Params = Any
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
+
+if TYPE_CHECKING:
+    import jax
+    import numpy as np
+
+    Array: TypeAlias = jax.Array | np.ndarray
+    Offsets: TypeAlias = int | Array | Sequence[int | Array]
+else:  # nobody pays for jax who only reads the names
+    Array = Offsets = Any
+
+Params: TypeAlias = Any
 """A tree of float32 arrays."""
-Array = Any
-"""A numpy or a jax array."""
 
 
 class Window(NamedTuple):
@@ -53,39 +62,79 @@ class Encoder(NamedTuple):
         features: D.
         observation_shape: (H, W, S).
         make_decoder: (extra_inputs: int = 0) -> Decoder; its input is the latent joined with that many
-            more numbers (a one-hot action, say).
+            more numbers (a one-hot action, say). None where there is no decoder.
+        map_shape: (H', W', C'), the last convolution's map of one observation before it is flattened; None
+            where there is none, or it is not known.
     """
 
-    init: Callable
-    apply: Callable
+    init: Callable[[jax.Array], Params]
+    apply: Callable[[Params, Array], jax.Array]
     features: int
-    observation_shape: tuple
-    make_decoder: Callable
+    observation_shape: tuple[int, ...]
+    make_decoder: MakeDecoder | None
+    map_shape: tuple[int, ...] | None = None
 
 
 class Decoder(NamedTuple):
     """A decoder, as pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S]."""
 
-    init: Callable
-    apply: Callable
+    init: Callable[[jax.Array], Params]
+    apply: Callable[[Params, Array], jax.Array]
+
+
+class MakeDecoder(Protocol):
+    """The type of `Encoder.make_decoder`."""
+
+    def __call__(self, extra_inputs: int = 0) -> Decoder: ...
+
+
+def no_decoder(extra_inputs: int = 0) -> Decoder:
+    """`Context.make_decoder` where there is no decoder.
+
+    Raises:
+        ValueError: always; an objective that asks for a decoder cannot be built.
+    """
+    raise ValueError("it needs a decoder, and the encoder has none")
 
 
 class Context(NamedTuple):
-    """What a factory may know of the run that it is built for: the encoder and the number of actions."""
+    """What a factory may know of the run that it is built for: what it stands on.
 
-    encoder: Encoder
+    Attributes:
+        features: D, the latent's size.
+        num_actions: A.
+        make_decoder: as of `Encoder`; raises ValueError where there is no decoder.
+        map_shape: as of `Encoder`.
+    """
+
+    features: int
     num_actions: int
+    make_decoder: MakeDecoder = no_decoder
+    map_shape: tuple[int, ...] | None = None
+
+    @classmethod
+    def of(cls, encoder: Encoder, num_actions: int) -> Context:
+        """The context of objectives over an encoder."""
+        return cls(encoder.features, num_actions, encoder.make_decoder or no_decoder, encoder.map_shape)
 
 
 class Latents(NamedTuple):
     """The latents of a window's observations under the online and the slow encoder.
 
     `online(k)` and `slow(k)` give float32 [B, D] for offset k, an int or an int32 array [B] (one offset
-    per row). The same offset is encoded at most once per trace, however many objectives ask for it.
+    per row). For a sequence of K offsets, a list say, they give float32 [K, B, D], by one call of the encoder
+    with K * B rows.
+
+    The same offset is encoded at most once per trace, however many objectives ask for it. Offsets are the
+    same if they are equal ints, one and the same array, or arrays of equal numbers where these are known
+    when they are traced, as those of numpy arrays are. The same list is encoded once, too, and so is an
+    offset that a list holds twice. But an offset alone and the same offset in a list are both encoded, and
+    so are the offsets that two different lists share: what one objective asks for never changes the
+    roundings of what another one sees.
     """
 
-    online: Callable
-    slow: Callable
+    online: Callable[[Offsets], jax.Array]
+    slow: Callable[[Offsets], jax.Array]
 
 
 class Objective(NamedTuple):
@@ -104,13 +153,13 @@ class Objective(NamedTuple):
             picture that shows what it learnt.
     """
 
-    init: Callable
-    loss: Callable
+    init: Callable[[jax.Array], Params]
+    loss: Callable[[Params, Params, Latents, Window, jax.Array], tuple[jax.Array, Mapping[str, jax.Array]]]
     weight: float = 1.0
     horizon: int = 0
-    slow: Callable | None = None
+    slow: Callable[[Params, Params, Array], Params] | None = None
     is_decoder: bool = False
-    image: Callable | None = None
+    image: Callable[[Params, Latents, Window], tuple[jax.Array, jax.Array]] | None = None
 
 
 class TrainState(NamedTuple):

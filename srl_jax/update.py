@@ -2,17 +2,18 @@
 
 import math
 import zlib
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import optax
 
 from srl_jax.augment import random_shift
 from srl_jax.modes import ENCODER_OPTIMIZERS, Mode
 from srl_jax.optim import ENCODER, ENCODER_SRL, RL, Optimizer, measured, real_copy
-from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
+from srl_jax.types import Array, Encoder, Latents, Objective, Offsets, Params, TrainState, Window
 from srl_jax.window import observation, stack_last
 
 NORM_EVERY = 10
@@ -31,7 +32,7 @@ class Hyper(NamedTuple):
     learning_rates: dict[str, Array]
 
 
-def named_key(key: Array, name: str) -> Array:
+def named_key(key: jax.Array, name: str) -> jax.Array:
     """A key that depends on a name alone, so that enabling one objective never changes another's noise."""
     return jax.random.fold_in(key, zlib.crc32(name.encode()))
 
@@ -43,6 +44,25 @@ def periodic(every: int) -> Callable:
         return jax.lax.cond(step % every == 0, lambda: new, lambda: old)
 
     follow.every = every
+    return follow
+
+
+def ema(tau: float) -> Callable:
+    """The rule of a slow copy that is an exponential moving average, moved in every update.
+
+    `slow = tau * slow + (1 - tau) * online`: tau is the share of the copy that stays. Near 1 it follows
+    slowly, at 0 it is the original as the same update left it. BYOL (Grill et al. 2020, equation 1) and SPR
+    (Schwarzer et al. 2021, section 2.2) mean this by tau; soft actor-critic means 1 - tau.
+
+    Raises:
+        ValueError: tau is not in [0, 1); at 1 the copy would stand still.
+    """
+    if not 0 <= tau < 1:
+        raise ValueError(f"tau must be at least 0 and below 1, not {tau}")
+
+    def follow(new: Params, old: Params, step: Array) -> Params:
+        return jax.tree.map(lambda n, o: tau * o + (1 - tau) * n, new, old)
+
     return follow
 
 
@@ -357,20 +377,42 @@ def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window)
     return Latents(encoded(encoder, params, window), frozen(encoded(encoder, slow, window)))
 
 
-def encoded(encoder: Encoder, params: Params, window: Window) -> Callable:
-    """offset -> latents; encodes an offset at most once for each object given as offset."""
-    known = {}
+def encoded(encoder: Encoder, params: Params, window: Window) -> Callable[[Offsets], jax.Array]:
+    """offset -> latents, list of offsets -> latents of each: what `Latents` says of one encoder."""
+    known: dict[Hashable, tuple[jax.Array, Mapping[Hashable, int | Array]]] = {}
 
-    def latent(k: int | Array) -> Array:
-        index = k if isinstance(k, int) else id(k)
-        if index not in known:  # the offset is kept too, so that its id stays its own
-            known[index] = (encoder.apply(params, observation(window, k)), k)
-        return known[index][0]
+    def latent(k: Offsets) -> jax.Array:
+        several = isinstance(k, Sequence)
+        asked = k if isinstance(k, Sequence) else (k,)
+        identities = [_identity(offset) for offset in asked]
+        offsets = dict(zip(identities, asked, strict=True))
+        index = several, *offsets
+        if index not in known:  # the offsets are kept too, so that their ids stay their own
+            views = [observation(window, offset) for offset in offsets.values()]
+            z = encoder.apply(params, jnp.concatenate(views) if several else views[0])
+            known[index] = z, offsets
+        z, _ = known[index]
+        if not several:
+            return z
+        z = z.reshape(len(offsets), -1, *z.shape[1:])
+        if len(offsets) == len(identities):
+            return z
+        places = list(offsets)
+        return z[np.array([places.index(identity) for identity in identities])]
 
     return latent
 
 
-def frozen(latent: Callable) -> Callable:
+def _identity(offset: int | Array) -> Hashable:
+    """What two offsets that are known to be equal have in common."""
+    if isinstance(offset, int):
+        return offset
+    if isinstance(offset, jax.core.Tracer):
+        return "tracer", id(offset)
+    return np.shape(offset), np.asarray(offset).tobytes()
+
+
+def frozen(latent: Callable[[Offsets], jax.Array]) -> Callable[[Offsets], jax.Array]:
     """The same latents without gradient."""
     return lambda k: jax.lax.stop_gradient(latent(k))
 

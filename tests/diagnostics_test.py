@@ -22,7 +22,7 @@ from srl_jax.optim import RL
 from srl_jax.replay import Replay
 from srl_jax.types import Objective, TrainState
 from srl_jax.update import Hyper, make_conflict
-from tests.helpers import SMALL, jit, make_context, make_window, random_params
+from tests.helpers import SMALL, jit, make_encoder, make_window, random_params
 
 RNG = np.random.default_rng(0)
 
@@ -177,10 +177,10 @@ def objective(scale):
 
 
 def test_gradient_conflict_of_losses_whose_gradients_are_known():
-    context = make_context()
+    encoder = make_encoder()
     terms = {RL: objective(2.0), "same": objective(1.0), "against": objective(-6.0)}
     params = {
-        "encoder": random_params(context.encoder.init),
+        "encoder": random_params(encoder.init),
         **{name: {"w": np.float32(1)} for name in terms},
     }
     slow = {}
@@ -189,7 +189,7 @@ def test_gradient_conflict_of_losses_whose_gradients_are_known():
     # In mode decoupled RL's gradient does not enter the encoder; this is the one that it would be.
     for mode in ("joint", "decoupled"):
         options = {"augment": "none", "target_encoder": "slow"}
-        conflict = jit(make_conflict(context.encoder, terms, MODES[mode], **options))
+        conflict = jit(make_conflict(encoder, terms, MODES[mode], **options))
         found = {
             name: [float(x) for x in pair] for name, pair in conflict(state, make_window(), hyper).items()
         }
@@ -197,16 +197,14 @@ def test_gradient_conflict_of_losses_whose_gradients_are_known():
 
 
 def test_an_image_of_two_latents_is_left_out_and_told():
-    context = make_context()
-    decoder = context.encoder.make_decoder()
+    encoder = make_encoder()
+    decoder = encoder.make_decoder()
 
     def later(head, latents, window):
         return latents.online(1), decoder.apply(head, latents.online(0))
 
     terms = {"one": objective(1.0)._replace(image=later, horizon=1)}
-    functions = make_functions(
-        context.encoder, terms, MODES["pretrain"], augment="none", target_encoder="slow"
-    )
+    functions = make_functions(encoder, terms, MODES["pretrain"], augment="none", target_encoder="slow")
     assert functions.decode == {} and functions.others == ("one",) and functions.conflict is None
 
 

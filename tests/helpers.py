@@ -56,7 +56,12 @@ jit = partial(jax.jit, compiler_options=_compiler_options())
 
 
 def make_context(features: int = 8) -> Context:
-    """A linear encoder with a tanh and a linear decoder, and NUM_ACTIONS actions.
+    """What objectives over `make_encoder`'s latents read, with NUM_ACTIONS actions."""
+    return Context.of(make_encoder(features), NUM_ACTIONS)
+
+
+def make_encoder(features: int = 8) -> Encoder:
+    """A linear encoder with a tanh and a linear decoder.
 
     Losses see latents and a decoder, whatever they are made of, and these compile quickly.
     """
@@ -73,7 +78,7 @@ def make_context(features: int = 8) -> Context:
         decode = lambda params, x: (x @ params["kernel"]).reshape(-1, *shape)  # noqa: E731
         return Decoder(linear(features + extra_inputs, pixels), decode)
 
-    return Context(Encoder(linear(pixels, features), encode, features, shape, make_decoder), NUM_ACTIONS)
+    return Encoder(linear(pixels, features), encode, features, shape, make_decoder)
 
 
 def make_window(seed: int = 0, *, batch: int = 4, horizon: int = 3, size: int = SIZE) -> Window:

@@ -1,9 +1,12 @@
 """srl_jax/modes.py and agent.py: the mode x parameter-group matrix, of small but real runs."""
 
+import dataclasses
 import functools
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 from srl_jax import encoders, objectives, rl
@@ -11,7 +14,8 @@ from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.modes import MODES
 from srl_jax.optim import RL, make_optimizer
-from srl_jax.update import make_init, make_update, periodic
+from srl_jax.types import Context, Objective
+from srl_jax.update import ema, make_init, make_update, periodic
 from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_window, random_state
 
 TERMS = ("reconstruction", "inverse")
@@ -206,17 +210,85 @@ def test_everything_is_float32_also_where_jax_may_use_64_bits(mode):
             assert leaf.dtype not in (np.float64, np.int64), (encoder, name)
 
 
-@pytest.mark.parametrize("mode", MODES)
-def test_slow_copies_follow_their_objective_in_every_mode(mode):
-    # An objective with a rule has a slow copy of the encoder and of its head, which the rule moves.
-    rules = {RL: periodic(2), "reconstruction": lambda new, old, step: new}
-    agent, _, _ = build(mode)
-    terms = {n: o._replace(slow=rules.get(n)) for n, o in agent.objectives.items()}
+@functools.cache
+def two_updates_of_the_registry(mode):
+    """Rules, and the states before, between and after, where every objective has a rule of its own."""
+    agent = make_agent(small(mode), NUM_ACTIONS)
+    context = Context.of(agent.encoder, NUM_ACTIONS)
+    terms = {n: o for n, o in agent.objectives.items() if n == RL}
+    if MODES[mode].representation:
+        terms |= {name: factory(context) for name, factory in objectives.REGISTRY.items()}
+    rules = {name: periodic(2) if name == RL else ema(0.9 - 0.1 * i) for i, name in enumerate(terms)}
+    terms = {name: objective._replace(slow=rules[name]) for name, objective in terms.items()}
     optimizer = make_optimizer(terms)
     state = random_state(make_init(agent.encoder, terms, MODES[mode], optimizer))
-    assert set(state.slow) == set(rules) & set(terms)
-    update = make_update(agent.encoder, terms, MODES[mode], optimizer)
-    after = jit(update)(state, WINDOW, agent.hyper)[0]
-    for name, slow in after.slow.items():
-        now = {"encoder": after.params["encoder"], "head": after.params[name]}
-        assert identical(slow, now if name != RL else state.slow[name])
+    update = jit(make_update(agent.encoder, terms, MODES[mode], optimizer))
+    hyper = agent.hyper._replace(weights=dict.fromkeys(terms, np.float32(1)))
+    states = [state]
+    for _ in range(2):
+        states.append(update(states[-1], WINDOW, hyper)[0])
+    return rules, states
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_slow_copies_of_every_objective_move_by_its_rule_in_every_mode(mode):
+    rules, states = two_updates_of_the_registry(mode)
+    encoder_moves = "encoder" in MOVES[mode]
+    assert all(set(state.slow) == set(rules) for state in states)
+    for before, after in zip(states, states[1:], strict=False):
+        for name, rule in rules.items():
+            old, now = before.slow[name], after.slow[name]
+            online = {"encoder": after.params["encoder"], "head": after.params[name]}
+            expected = rule(online, old, after.step)
+            jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-7), now, expected)
+            if name != RL:  # and it is a rule that moves them
+                assert all_moved(now["head"], old["head"]), name
+                assert all_moved(now["encoder"], old["encoder"]) == encoder_moves, name
+    if RL in rules:
+        start, between, end = (state.slow[RL] for state in states)
+        assert identical(start, between)
+        assert identical(end, {"encoder": states[2].params["encoder"], "head": states[2].params[RL]})
+
+
+def spr(context, *, steps: int = 5, tau: float = 0.99, projection: int = 6):
+    """Slow projections of the next latents from this one and the actions (after Schwarzer et al. 2021)."""
+    inputs = context.features + context.num_actions
+    shapes = {"step": (inputs, context.features), "project": (context.features, projection)}
+    shapes["predict"] = (projection, projection)
+
+    def init(key):
+        keys = jax.random.split(key, len(shapes))
+        return {name: jax.random.normal(k, shapes[name]) for name, k in zip(shapes, keys, strict=True)}
+
+    def loss(head, slow_head, latents, window, key):
+        targets = jax.lax.stop_gradient(latents.slow(list(range(1, steps + 1))) @ slow_head["project"])
+        z, losses = latents.online(0), 0.0
+        for k in range(steps):
+            action = jax.nn.one_hot(window.actions[:, k], context.num_actions)
+            z = jnp.tanh(jnp.concatenate([z, action], -1) @ head["step"])
+            prediction = z @ head["project"] @ head["predict"]
+            cosine = optax.losses.cosine_similarity(prediction, targets[k], epsilon=1e-6)
+            losses += window.valid[:, k] * (1 - cosine)
+        return losses / steps, {}
+
+    return Objective(init, loss, horizon=steps, slow=ema(tau))
+
+
+@pytest.mark.parametrize("mode", ["joint", "pretrain"])
+def test_a_self_predictive_objective_has_a_slow_encoder_that_moves(mode, monkeypatch):
+    monkeypatch.setitem(objectives.REGISTRY, "spr", spr)
+    agent = make_agent(dataclasses.replace(small(mode), objectives=("spr",)), NUM_ACTIONS)
+    assert agent.horizon == 5 and agent.follow_every == 1
+    update, follow = jit(agent.update.pure), jit(agent.follow.__wrapped__)
+    window = make_window(size=FRAME, horizon=5)
+    start = state = random_state(agent.init)
+    slow = start.slow["spr"]
+    for _ in range(3):
+        state = follow(update(state, window, agent.hyper)[0])
+        online = {"encoder": state.params["encoder"], "head": state.params["spr"]}
+        slow = jax.tree.map(lambda s, o: 0.99 * s + 0.01 * o, slow, online)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), state.slow["spr"], slow)
+    assert all_moved(state.slow["spr"], start.slow["spr"])
+    assert all_moved(state.slow["spr"]["encoder"], state.params["encoder"])
+    if mode == "joint":  # RL's own copy of the same encoder goes by RL's rule: replaced after two updates
+        assert not identical(state.slow[RL]["encoder"], state.slow["spr"]["encoder"])

@@ -18,11 +18,11 @@ from srl_jax.objectives.inverse import action_cross_entropy
 from srl_jax.objectives.latent_l2 import half_squared_norm
 from srl_jax.objectives.reconstruction import mean_squared_error
 from srl_jax.optim import RL, make_optimizer
-from srl_jax.types import Latents, Objective, TrainState, Window
+from srl_jax.types import Context, Latents, Objective, TrainState, Window
 from srl_jax.update import Hyper, make_init, make_latents, make_update, periodic, shut
 from srl_jax.window import image
 from tests import helpers
-from tests.helpers import SIZE, STACK, jit, make_context, make_window
+from tests.helpers import SIZE, STACK, jit, make_context, make_encoder, make_window
 
 BATCH = 4
 
@@ -94,6 +94,22 @@ def test_default_weights_are_the_thesis_ones():
     assert objectives.inverse(make_context(), weight=0.25).weight == 0.25
 
 
+@pytest.mark.parametrize("name", ["reconstruction", "forward_pixels"])
+def test_a_decoder_that_is_not_there_is_told_in_one_line(name):
+    spec = specs.parse(name, objectives.REGISTRY, "objective")
+    message = f"^--objective={name}: it needs a decoder, and the encoder has none$"
+    bare = Context.of(make_encoder()._replace(make_decoder=None), helpers.NUM_ACTIONS)
+    for context in (Context(features=8, num_actions=3), bare):
+        with pytest.raises(specs.SpecError, match=message):
+            specs.build(spec, objectives.REGISTRY, context)
+
+
+def test_a_context_is_what_the_encoder_says():
+    encoder = make_encoder(features=5)
+    assert Context.of(encoder, 7) == (5, 7, encoder.make_decoder, None)
+    assert Context.of(encoder._replace(map_shape=(2, 3, 4)), 7).map_shape == (2, 3, 4)
+
+
 # Every row
 
 
@@ -123,13 +139,13 @@ class Row(NamedTuple):
 
 @functools.cache
 def build(kind: str, name: str) -> Row:
-    context = make_context()
+    encoder, context = make_encoder(), make_context()
     factory = {"objectives": objectives, "rl": rl}[kind].REGISTRY[name]
     options = {"hidden": 16} if "hidden" in specs.option_defaults(factory) else {}
     objective = factory(context, **options)
     if kind == "rl":
         name, objective = RL, objective.objective._replace(slow=periodic(1000))
-    terms, encoder = {name: objective}, context.encoder
+    terms = {name: objective}
     optimizer = make_optimizer(terms, adam_eps=1e-4)
     init = make_init(encoder, terms, MODES["joint"], optimizer)
     state = helpers.random_state(init)

@@ -10,7 +10,14 @@ import rlax
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax.rl.losses import categorical_projection, categorical_q_learning, huber, n_step, q_learning
+from srl_jax.rl.losses import (
+    categorical_projection,
+    categorical_q_learning,
+    huber,
+    n_step,
+    q_learning,
+    quantile_q_learning,
+)
 from tests.helpers import jit
 
 # rlax's categorical losses call a function of its own that it means to drop one day.
@@ -152,6 +159,44 @@ def test_categorical_q_learning_by_hand():
     )
     assert float(loss(0)) == pytest.approx(np.log(3), rel=1e-5)
     assert float(loss(1)) == pytest.approx(0.5 * np.log(4) + 0.5 * np.log(2), rel=1e-5)
+
+
+@pytest.mark.parametrize("kappa", [0.5, 1.0, 2.0])
+def test_quantile_q_learning_is_rlax_quantile_q_learning(kappa):
+    x = transitions()
+    names = ("q_logits_tm1", "r_t", "discount_t", "q_logits_slow_t", "q_selector_t")
+    shares = (jnp.arange(ATOMS) + 0.5) / ATOMS
+
+    def ours(q, r, d, slow, selector, a):
+        return quantile_q_learning(q, a, r, d, slow, selector, kappa)
+
+    def theirs(q, r, d, slow, selector, a):  # [M, A]; a distribution of one number is its own mean
+        return rlax.quantile_q_learning(q.T, shares, a, r, d, selector[None], slow.T, kappa)
+
+    run = jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
+    (losses, grads), reference = run([x[n] for n in names], x["a_tm1"])
+    close((losses, grads), reference)
+    assert np.any(grads[0])
+    for gradient in grads[1:]:
+        assert not np.any(gradient)
+
+
+def test_quantile_q_learning_by_hand():
+    # A terminal state. Two quantiles, 0 and 1, are at the shares 1/4 and 3/4 of probability.
+    # A return of 0.5 is above the first and below the second, each at 1/4 of the Huber loss 0.125: 0.0625.
+    # A return of 3 is above both: 1/4 * 2.5 + 3/4 * 1.5 = 1.75.
+    quantiles, slow, selector = jnp.array([[0.0, 1.0]]), jnp.zeros((1, 2)), jnp.zeros(1)
+    loss = jit(lambda r: quantile_q_learning(quantiles, jnp.int32(0), r, jnp.float32(0), slow, selector))
+    assert float(loss(jnp.float32(0.5))) == pytest.approx(0.0625)
+    assert float(loss(jnp.float32(3.0))) == pytest.approx(1.75)
+    # The selector prefers action 1, of slow quantiles 2 and 4: the targets are 1 + 0.5 * 2 and 1 + 0.5 * 4.
+    # Action 0 was taken. Its quantile 0 has the errors 2 and 3: 1/4 * (1.5 + 2.5) / 2. Its quantile 1 has the
+    # errors 1 and 2: 3/4 * (0.5 + 1.5) / 2.
+    quantiles, slow = jnp.array([[0.0, 1.0], [9.0, 9.0]]), jnp.array([[7.0, 7.0], [2.0, 4.0]])
+    value = quantile_q_learning(
+        quantiles, jnp.int32(0), jnp.float32(1), jnp.float32(0.5), slow, jnp.array([0.0, 1.0])
+    )
+    assert float(value) == pytest.approx(0.5 + 0.75)
 
 
 def test_categorical_projection_by_hand():

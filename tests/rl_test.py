@@ -1,6 +1,8 @@
 """srl_jax/rl: the algorithms against a network in numpy and rlax's losses; what every row has to keep is in
 objectives_test.py."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,15 +10,15 @@ import optax
 import pytest
 import rlax
 
-from srl_jax import rl
-from srl_jax.rl import heads
-from srl_jax.types import Context, Encoder, Latents, Window
-from tests.helpers import all_zero, count, jit, random_params
+from srl_jax import rl, specs
+from srl_jax.rl import heads, values
+from srl_jax.types import Context, Latents, Window
+from tests.helpers import all_zero, count, identical, jit, random_params
 
 pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:PendingDeprecationWarning")
 
 BATCH, FEATURES, ACTIONS, ATOMS = 6, 5, 3, 7
-CONTEXT = Context(Encoder(None, None, FEATURES, (1, 1, 4), None), ACTIONS)
+CONTEXT = Context(FEATURES, ACTIONS)
 ATOMS_51 = np.linspace(-10, 10, 51, dtype=np.float32)
 SMALL = {"init_std": 0.0, "hidden": 8, "atoms": ATOMS, "v_min": -2.0, "v_max": 4.0}
 
@@ -80,18 +82,21 @@ def softmax(x):
 
 
 @pytest.mark.parametrize(
-    ("distributional", "double", "dueling", "n_step", "priority"),
+    ("kind", "double", "dueling", "n_step"),
     [
-        (True, True, True, 3, "kl"),
-        (True, False, False, 2, "cross_entropy"),
-        (False, True, False, 3, "kl"),
-        (False, False, True, 1, "cross_entropy"),
+        ("kl", True, True, 3),
+        ("cross_entropy", False, False, 2),
+        ("scalar", True, False, 3),
+        ("scalar", False, True, 1),
+        ("quantile", True, True, 3),
+        ("quantile", False, False, 1),
     ],
 )
-def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step, priority):
-    parts = {"distributional": distributional, "double": double, "dueling": dueling, "n_step": n_step}
-    parts["priority"] = priority
-    algorithm = rl.rainbow(CONTEXT, noisy=False, **parts, **SMALL)
+def test_loss_is_rlax_on_the_n_step_view(kind, double, dueling, n_step):
+    kinds = {"scalar": values.scalar, "quantile": partial(values.quantile, quantiles=ATOMS)}
+    categorical = partial(values.categorical, atoms=ATOMS, v_min=-2.0, v_max=4.0, priority=kind)
+    its_values = kinds.get(kind, categorical)()
+    algorithm = rl.q_learner(CONTEXT, its_values, double=double, dueling=dueling, n_step=n_step, hidden=8)
     objective = algorithm.objective
     head, slow_head = (random_params(objective.init, seed) for seed in (1, 2))
     online, slow, window = make_case()
@@ -107,7 +112,8 @@ def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step
     losses, metrics, q_values = run(head, slow_head, online, slow, jax.random.key(0))
 
     atoms = np.linspace(-2, 4, ATOMS, dtype=np.float32)
-    expected = lambda out: softmax(out) @ atoms if distributional else out[..., 0]  # noqa: E731
+    distributional = kind in values.PRIORITIES
+    expected = lambda out: softmax(out) @ atoms if distributional else out.mean(-1)  # noqa: E731
     td_error, unweighted = [], []
     for b in range(BATCH):
         total, discount, offset = 0.0, 1.0, 0
@@ -126,14 +132,21 @@ def test_loss_is_rlax_on_the_n_step_view(distributional, double, dueling, n_step
             best = softmax(slow_t[selector.argmax()])
             target = np.asarray(rlax.categorical_l2_project(total + discount * atoms, best, atoms))
             target_entropy = -np.sum(target * np.log(target + 1e-30))
-            td_error.append(float(loss) - (target_entropy if priority == "kl" else 0))
+            td_error.append(float(loss) - (target_entropy if kind == "kl" else 0))
             unweighted.append(float(loss))
         else:
             loss = rlax.double_q_learning(
-                out_tm1[:, 0], action, total, discount, jnp.asarray(slow_t[:, 0]), jnp.asarray(selector)
+                expected(out_tm1), action, total, discount, expected(slow_t), jnp.asarray(selector)
             )
             td_error.append(float(loss))
-            unweighted.append(float(rlax.huber_loss(loss)))
+            if kind == "scalar":
+                unweighted.append(float(rlax.huber_loss(loss)))
+                continue
+            shares = (np.arange(ATOMS, dtype=np.float32) + 0.5) / ATOMS
+            quantiles = rlax.quantile_q_learning(
+                out_tm1.T, shares, action, total, discount, jnp.asarray(selector[None]), slow_t.T, 1.0
+            )
+            unweighted.append(float(quantiles))
     unweighted = np.array(unweighted)
 
     np.testing.assert_allclose(q_values, expected(network(head, online[0], dueling)), rtol=1e-4, atol=1e-5)
@@ -160,8 +173,7 @@ def test_gradient_flows_through_the_sampled_state_alone():
 
 
 def test_noise_needs_a_key_and_differs_between_the_networks():
-    plain = {"distributional": False, "double": False, "dueling": False, "n_step": 1, "hidden": 8}
-    algorithm = rl.rainbow(CONTEXT, **plain)
+    algorithm = rl.q_learner(CONTEXT, values.scalar(), noisy=True, hidden=8)
     head = random_params(algorithm.objective.init)
     online, _, window = make_case()
     # Every state's latents are the same, rewards are 0 and nothing is discounted. The slow network is the
@@ -228,9 +240,8 @@ def facts(algorithm):
 
 def test_rows_are_what_their_names_say():
     rows = {name: factory(CONTEXT) for name, factory in rl.REGISTRY.items()}
-    for name in ("dqn", "double", "c51"):
+    for name, outputs in {"dqn": 1, "double": 1, "c51": 51, "qr_dqn": 200}.items():
         assert rows[name].objective.horizon == 1 and rows[name].alpha == 0.0
-        outputs = 51 if name == "c51" else 1
         hidden, out = FEATURES * 512 + 512, 512 * ACTIONS * outputs + ACTIONS * outputs
         assert sum(np.prod(shape) for shape in leaf_names(rows[name]).values()) == hidden + out
     assert rows["rainbow"].objective.horizon == 3 and rows["rainbow"].alpha == 0.5
@@ -247,10 +258,50 @@ def test_rows_are_what_their_names_say():
     assert not np.allclose(*losses(online, slow))
 
 
+def test_a_row_has_the_options_that_something_reads():
+    parts = set(specs.option_defaults(rl.q_learner))
+    distribution = specs.option_defaults(values.categorical)
+    own = {"c51": set(distribution), "qr_dqn": {"quantiles"}, "double": set(), "dqn": set()}
+    for name, options in own.items():
+        assert set(specs.option_defaults(rl.REGISTRY[name])) == parts | options
+    rainbow = specs.option_defaults(rl.rainbow)
+    assert set(rainbow) == parts | set(distribution) | {"distributional"}
+    assert distribution.items() <= rainbow.items()
+    with pytest.raises(specs.SpecError, match="--rl=dqn:v_min=-1: dqn has no option 'v_min'"):
+        specs.parse("dqn:v_min=-1", rl.REGISTRY, "rl")
+
+
+def test_an_option_of_a_distribution_is_refused_without_one():
+    # config.json of a run without a distribution has the defaults of its options, which say nothing.
+    spec = specs.parse("rainbow:distributional=false", rl.REGISTRY)
+    specs.build(specs.parse(spec.full, rl.REGISTRY), rl.REGISTRY, CONTEXT)
+    for options in ({"atoms": 50}, {"v_min": -1.0}, {"v_max": 1.0}, {"init_std": 1.0}, {"priority": "kl"}):
+        (name,) = options
+        with pytest.raises(ValueError, match=f"distributional=false nothing reads {name}; leave that out"):
+            rl.rainbow(CONTEXT, distributional=False, **options)
+
+
+@pytest.mark.parametrize(("distributional", "row"), [(True, "c51"), (False, "dqn")])
+def test_rainbow_without_its_parts_is_the_row(distributional, row):
+    nothing = dict.fromkeys(("double", "dueling", "noisy", "prioritized"), False)
+    whole = rl.rainbow(CONTEXT, distributional=distributional, n_step=1, hidden=8, **nothing)
+    row = rl.REGISTRY[row](CONTEXT, hidden=8)
+    assert facts(whole) == facts(row)
+    head, slow_head = (random_params(row.objective.init, seed) for seed in (1, 2))
+    online, slow, window = make_case()
+
+    @jit
+    def both(online, slow):
+        arguments = head, slow_head, make_latents(online, slow), window, jax.random.key(0)
+        return [algorithm.objective.loss(*arguments) for algorithm in (whole, row)]
+
+    assert identical(*both(online, slow))
+
+
 def test_head_of_the_thesis_has_its_size():
     # On nature's 3,136 features, 6 actions: each stream 3136 * 512 + 512 = 1,606,144, then 512 * 306 + 306 =
     # 156,978 and 512 * 51 + 51 = 26,163; all of it twice, since every weight has its sigma.
-    context = Context(Encoder(None, None, 3136, (84, 84, 4), None), 6)
+    context = Context(3136, 6)
     shapes = jax.eval_shape(rl.rainbow(context).objective.init, jax.random.key(0))
     assert count(shapes) == 2 * (2 * 1_606_144 + 156_978 + 26_163)
 
@@ -301,18 +352,29 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
 def test_options_that_cannot_be_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         rl.rainbow(CONTEXT, **options)
-    if options.keys() & {"atoms", "v_min", "init_std"}:  # the support matters only where there is one
-        rl.rainbow(CONTEXT, distributional=False, **options)
 
 
-@pytest.mark.parametrize("v_max", [10.0, 1000.0])
-def test_values_are_learnt_whatever_the_support(v_max):
-    # An episode of one step that gives a tenth of the largest value: that is what its action is worth.
-    algorithm = rl.rainbow(CONTEXT, noisy=False, hidden=32, n_step=1, v_min=-v_max, v_max=v_max)
+def test_quantiles_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="quantiles must be at least 1 and at most 65536"):
+        values.quantile(quantiles=0)
+
+
+LEARNT = {
+    "categorical": (values.categorical(), 1.0),
+    "categorical, wide": (values.categorical(v_min=-1000.0, v_max=1000.0), 100.0),
+    "scalar": (values.scalar(), 1.0),
+    "quantile": (values.quantile(quantiles=20), 1.0),
+}
+
+
+@pytest.mark.parametrize(("kind", "reward"), LEARNT.values(), ids=LEARNT)
+def test_values_are_learnt(kind, reward):
+    # An episode of one step is worth its reward.
+    algorithm = rl.q_learner(CONTEXT, kind, dueling=True, hidden=32)
     head = random_params(algorithm.objective.init)
     online, slow, window = make_case()
     window = window._replace(
-        rewards=np.full_like(window.rewards, v_max / 10),
+        rewards=np.full_like(window.rewards, reward),
         discounts=np.zeros_like(window.discounts),
         valid=np.ones_like(window.valid),
         weight=np.ones_like(window.weight),
@@ -332,4 +394,4 @@ def test_values_are_learnt_whatever_the_support(v_max):
     for _ in range(200):
         head, state = update(head, state)
     q = np.asarray(algorithm.q_values(head, online[0]))[np.arange(BATCH), window.actions[:, 0]]
-    np.testing.assert_allclose(q, v_max / 10, rtol=0.1)
+    np.testing.assert_allclose(q, reward, rtol=0.1)

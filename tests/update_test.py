@@ -12,6 +12,7 @@ from srl_jax.optim import RL, make_optimizer
 from srl_jax.types import Encoder, Objective
 from srl_jax.update import (
     Hyper,
+    ema,
     follow_every,
     make_act,
     make_follow,
@@ -152,7 +153,7 @@ def test_an_update_of_some_objectives_leaves_the_others_alone():
 
 
 def test_slow_copies_may_follow_apart_from_the_update():
-    every_update = lambda new, old, step: jax.tree.map(lambda n, o: 0.9 * o + 0.1 * n, new, old)  # noqa: E731
+    every_update = ema(0.9)
     cases = [
         ({RL: periodic(3)}, 3),
         ({RL: periodic(4), "a": periodic(6)}, 2),
@@ -211,8 +212,7 @@ def test_no_gradient_through_the_target_encoder():
 
 
 def test_an_objective_may_have_a_slow_copy_of_its_own_rule():
-    average = lambda new, old, step: jax.tree.map(lambda n, o: 0.5 * n + 0.5 * o, new, old)  # noqa: E731
-    terms = {RL: make_peek(slow=periodic(100)), "peek": make_peek(slow=average)}
+    terms = {RL: make_peek(slow=periodic(100)), "peek": make_peek(slow=ema(0.5))}
     optimizer = make_optimizer(terms)
     before = make_init(PIXELS, terms, MODES["joint"], optimizer)(jax.random.key(0))
     update = make_update(PIXELS, terms, MODES["joint"], optimizer)
@@ -248,6 +248,58 @@ def test_each_offset_is_encoded_once_however_many_losses_ask():
     assert len(calls) == 4
     np.testing.assert_array_equal(latents.online(offset), latents.online(0))
     np.testing.assert_allclose(latents.slow(offset), 2 * latents.online(0))
+
+
+def test_a_list_of_offsets_is_encoded_in_one_call():
+    rows = []
+    encoder = PIXELS._replace(apply=lambda params, x: rows.append(len(x)) or PIXELS.apply(params, x))
+    latents = make_latents(encoder, {"scale": 1.0}, {"scale": 2.0}, SMALL)
+    offset = jnp.array([3, 0, 1, 2], jnp.int32)
+    for several in ([1, offset, 3], (1, offset, 3)):
+        z = latents.slow(several)
+        assert z.shape == (3, 4, PIXELS.features)
+        assert rows == [12]  # K * B, once
+    for k, ours in zip((1, offset, 3), z, strict=True):
+        np.testing.assert_array_equal(ours, latents.slow(k))
+    assert rows == [12, 4, 4, 4]  # alone they are encoded each
+    twice = latents.online([2, 0, 2])
+    assert rows[4:] == [8]
+    np.testing.assert_array_equal(twice, latents.online([2, 0])[np.array([0, 1, 0])])
+    assert rows[4:] == [8]
+
+
+def test_equal_offsets_are_encoded_once_where_their_numbers_are_known():
+    calls = []
+    encoder = PIXELS._replace(apply=lambda params, x: calls.append(params) or PIXELS.apply(params, x))
+
+    def run(traced):
+        calls.clear()
+        latents = make_latents(encoder, {"scale": 1.0}, {"scale": 2.0}, SMALL)
+        for offset in (np.full(4, 1, np.int32), np.full(4, 1, np.int32), np.full(4, 2, np.int32)):
+            latents.online(offset)
+        known = len(calls)
+        for offset in (traced, traced, traced + 0):  # what a tracer will be is not known
+            latents.online(offset)
+        return known, len(calls) - known
+
+    found = []
+    jax.eval_shape(lambda offset: found.append(run(offset)), jnp.zeros(4, jnp.int32))
+    assert found == [(2, 2)]
+
+
+@pytest.mark.parametrize("tau", [0.0, 0.75, 0.99])
+def test_ema_keeps_a_share_tau_of_the_copy(tau):
+    # After three updates with the original at 1, a copy that started at 5 is 1 + 4 * tau ** 3.
+    rule, copy = ema(tau), {"w": jnp.full(2, 5.0)}
+    for step in (1, 2, 3):
+        copy = rule({"w": jnp.ones(2)}, copy, step)
+    np.testing.assert_allclose(copy["w"], 1 + 4 * tau**3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("tau", [-0.1, 1.0, float("nan")])
+def test_an_ema_that_could_not_follow_is_refused(tau):
+    with pytest.raises(ValueError, match="tau must be at least 0 and below 1"):
+        ema(tau)
 
 
 def test_state_can_be_donated_and_its_key_and_encoder_stay_the_callers():

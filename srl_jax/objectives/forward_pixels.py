@@ -15,7 +15,7 @@ def forward_pixels(context: Context, *, weight: float = 1.0) -> Objective:
     a one-hot vector (the thesis' code appends its number). The gradient flows into the decoder and, through
     z_t, into the encoder.
     """
-    decoder = context.encoder.make_decoder(context.num_actions)
+    decoder = context.make_decoder(context.num_actions)
 
     def picture(head, latents: Latents, window: Window):
         action = jax.nn.one_hot(window.actions[:, 0], context.num_actions, dtype=jnp.float32)

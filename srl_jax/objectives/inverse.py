@@ -1,5 +1,7 @@
 """The inverse model: which action led from one latent to the next."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -21,7 +23,7 @@ class InverseHead(nn.Module):
         return Dense(self.num_actions)(nn.relu(Dense(self.hidden)(x)))
 
 
-def action_cross_entropy(logits: Array, a_tm1: Array) -> Array:
+def action_cross_entropy(logits: Array, a_tm1: Array) -> jax.Array:
     """The cross-entropy of the action taken: float32 [A], int32 [] -> float32 [], in nats."""
     return -jax.nn.log_softmax(logits)[a_tm1]
 
@@ -36,10 +38,10 @@ def inverse(context: Context, *, weight: float = 1.0, hidden: int = 256) -> Obje
     """
     check_size("hidden", hidden)
     network = InverseHead(context.num_actions, hidden)
-    z = jnp.zeros((1, context.encoder.features))
+    z = jnp.zeros((1, context.features))
 
     def loss(head, slow_head, latents: Latents, window: Window, key):
-        logits = network.apply({"params": head}, latents.online(0), latents.online(1))
+        logits: Any = network.apply({"params": head}, latents.online(0), latents.online(1))
         losses = jax.vmap(action_cross_entropy)(logits, window.actions[:, 0])
         correct = jnp.mean(jnp.argmax(logits, -1) == window.actions[:, 0])
         return window.valid[:, 0] * losses, {"accuracy": jax.lax.stop_gradient(correct)}

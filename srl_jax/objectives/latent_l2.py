@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from srl_jax.types import Array, Context, Latents, Objective, Window
 
 
-def half_squared_norm(z: Array) -> Array:
+def half_squared_norm(z: Array) -> jax.Array:
     """`0.5 * sum(z ** 2)` of one latent: float32 [D] -> float32 []. A sum over D, as in SAC-AE."""
     return 0.5 * jnp.sum(z**2)
 

@@ -7,7 +7,7 @@ from srl_jax.types import Array, Context, Latents, Objective, Window
 from srl_jax.window import image
 
 
-def mean_squared_error(output: Array, target: Array) -> Array:
+def mean_squared_error(output: Array, target: Array) -> jax.Array:
     """The squared error of an image, averaged over all its pixels and channels.
 
     Args:
@@ -24,7 +24,7 @@ def reconstruction(context: Context, *, weight: float = 1.0) -> Objective:
 
     The gradient flows into the decoder and, through z_t, into the encoder.
     """
-    decoder = context.encoder.make_decoder()
+    decoder = context.make_decoder()
 
     def picture(head, latents: Latents, window: Window):
         return image(window, 0), decoder.apply(head, latents.online(0))

@@ -1,4 +1,4 @@
-"""The network on top of the latent: Q values or their distributions, dueling or not, noisy or not."""
+"""The network on top of the latent: the numbers of a kind of value, dueling or not, noisy or not."""
 
 import flax.linen as nn
 import jax.numpy as jnp
@@ -13,14 +13,14 @@ class QNetwork(nn.Module):
 
     Attributes:
         num_actions: A.
-        atoms: M, of the value distribution; 1 for plain values.
+        outputs: M, numbers for each action, as the kind of value has it: see `srl_jax.rl.values`.
         hidden: width of each stream.
         dueling, noisy: the parts of Rainbow; noise_std only matters where noisy.
-        prior: M constants added to the logits of every action: what the distribution starts near; none: 0.
+        prior: M constants added to the outputs of every action: what they start near; None: 0.
     """
 
     num_actions: int
-    atoms: int
+    outputs: int
     hidden: int
     dueling: bool
     noisy: bool
@@ -29,14 +29,14 @@ class QNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, z: Array, noise: Array | None) -> Array:
-        """float32 [B, D] -> float32 [B, A, M]: logits, or values where M is 1.
+        """float32 [B, D] -> float32 [B, A, M].
 
         Args:
             z: latents.
             noise: a row of what `noise` draws; None acts with the means.
         """
         lengths = self._noise_lengths(z.shape[-1])
-        parts = [None] * len(lengths)
+        parts: list = [None] * len(lengths)
         if self.noisy and noise is not None:
             parts = jnp.split(noise, np.cumsum(lengths)[:-1].tolist())
 
@@ -47,7 +47,7 @@ class QNetwork(nn.Module):
 
         def stream(name: str) -> Array:
             x = nn.relu(layer(f"{name}_hidden", self.hidden, z))
-            return layer(f"{name}_out", self._outputs[name], x).reshape(z.shape[0], -1, self.atoms)
+            return layer(f"{name}_out", self._sizes[name], x).reshape(z.shape[0], -1, self.outputs)
 
         prior = 0.0 if self.prior is None else jnp.asarray(self.prior, jnp.float32)
         q = stream("q")
@@ -64,12 +64,12 @@ class QNetwork(nn.Module):
         return factorised_noise(key, rows * size).reshape(rows, size)
 
     @property
-    def _outputs(self) -> dict[str, int]:
-        """The outputs of each stream."""
-        outputs = {"q": self.num_actions * self.atoms}
-        return outputs | {"v": self.atoms} if self.dueling else outputs
+    def _sizes(self) -> dict[str, int]:
+        """How many numbers each stream gives."""
+        sizes = {"q": self.num_actions * self.outputs}
+        return sizes | {"v": self.outputs} if self.dueling else sizes
 
     def _noise_lengths(self, features: int) -> list[int]:
         """The noise of each layer, in the order in which they are called."""
         hidden = self.hidden
-        return [n for outputs in self._outputs.values() for n in (features + hidden, hidden + outputs)]
+        return [n for size in self._sizes.values() for n in (features + hidden, hidden + size)]

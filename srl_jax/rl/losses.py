@@ -37,7 +37,7 @@ def q_learning(
     return target - q_tm1[a_tm1]
 
 
-def huber(td_error: Array, delta: float = 1.0) -> Array:
+def huber(td_error: Array, delta: float = 1.0) -> jax.Array:
     """The Huber loss of a temporal-difference error: quadratic within delta, linear beyond (any shape)."""
     size = jnp.abs(td_error)
     quadratic = jnp.minimum(size, delta)
@@ -52,7 +52,7 @@ def categorical_q_learning(
     discount_t: Array,
     q_logits_slow_t: Array,
     q_selector_t: Array,
-) -> Array:
+) -> jax.Array:
     """The cross-entropy of categorical (double) Q-learning, C51.
 
     The slow distribution of the selected action is shifted and scaled by the return and the discount,
@@ -82,19 +82,59 @@ def categorical_q_learning(
 
 def categorical_target(
     atoms: Array, r_t: Array, discount_t: Array, q_logits_slow_t: Array, q_selector_t: Array
-) -> Array:
+) -> jax.Array:
     """What `categorical_q_learning` compares with; arguments as there. float32 [M], no gradient."""
     probs_t = jax.nn.softmax(q_logits_slow_t[jnp.argmax(q_selector_t)])
     target = categorical_projection(r_t + discount_t * atoms, probs_t, atoms)
     return jax.lax.stop_gradient(target)
 
 
-def entropy(probs: Array) -> Array:
+def quantile_q_learning(
+    q_quantiles_tm1: Array,
+    a_tm1: Array,
+    r_t: Array,
+    discount_t: Array,
+    q_quantiles_slow_t: Array,
+    q_selector_t: Array,
+    kappa: float = 1.0,
+) -> jax.Array:
+    """The quantile Huber loss of quantile (double) Q-learning, QR-DQN.
+
+    Output i is the online estimate of the return's quantile at (i + 0.5) / M, the midpoint of the i-th of M
+    equal shares of probability. Each is compared with each of the slow quantiles of the selected action,
+    scaled by the discount and shifted by the return (Dabney et al. 2018, equations 9 and 10, algorithm 1).
+
+    Args:
+        q_quantiles_tm1: float32 [A, M], online quantiles of s_t, in units of reward; in any order.
+        a_tm1: int32 [], the action taken in s_t.
+        r_t: float32 [], the (n-step) return up to the state bootstrapped from.
+        discount_t: float32 [], that state's discount; 0 where terminal.
+        q_quantiles_slow_t: float32 [A, L], slow quantiles of that state.
+        q_selector_t: float32 [A], the expected values whose greedy action is evaluated.
+        kappa: where the Huber loss becomes linear, above 0, in units of reward.
+
+    Returns:
+        float32 [], a sum over the M online quantiles and a mean over the L slow ones. The gradient flows into
+        q_quantiles_tm1 alone.
+    """
+    chex.assert_rank(
+        [q_quantiles_tm1, a_tm1, r_t, discount_t, q_quantiles_slow_t, q_selector_t], [2, 0, 0, 0, 2, 1]
+    )
+    chex.assert_type([q_quantiles_tm1, a_tm1], [float, int])
+    target = jax.lax.stop_gradient(r_t + discount_t * q_quantiles_slow_t[jnp.argmax(q_selector_t)])
+    quantiles = q_quantiles_tm1[a_tm1]
+    error = target[None, :] - quantiles[:, None]
+    share = (jnp.arange(len(quantiles), dtype=jnp.float32) + 0.5) / len(quantiles)
+    weight = jnp.abs(share[:, None] - (error < 0))
+    return jnp.sum(jnp.mean(weight * huber(error, kappa), 1))
+
+
+def entropy(probs: Array) -> jax.Array:
     """The entropy of a distribution, float32 [M] -> [], in nats; `0 log 0` is 0."""
     return -jnp.sum(probs * jnp.log(jnp.maximum(probs, 1e-30)))
 
 
-def categorical_projection(support: Array, probs: Array, atoms: Array) -> Array:
+def categorical_projection(support: Array, probs: Array, atoms: Array) -> jax.Array:
     """Moves a distribution onto other atoms, each mass split between its two neighbours by distance.
 
     Args:
@@ -112,7 +152,7 @@ def categorical_projection(support: Array, probs: Array, atoms: Array) -> Array:
     return jnp.clip(1.0 - distance, 0.0, 1.0) @ probs
 
 
-def n_step(rewards: Array, discounts: Array, valid: Array, n: int):
+def n_step(rewards: Array, discounts: Array, valid: Array, n: int) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The n-step view of a window: what the return is, and where and with what discount to bootstrap.
 
     Sums rewards until n steps are done, a discount is 0 (a terminal state) or the episode is over. After a
