@@ -41,7 +41,7 @@ class Evaluator:
 
     Attributes:
         moment: of the evaluation under way, or None.
-        recording: uint8 [T, H, W], the first games of the last evaluation; None before there is one.
+        recording: uint8 [T, H, W, C], the first games of the last evaluation; None before there is one.
     """
 
     def __init__(self, config: Config, policy: Callable[[Params], Policy], make_env: Callable[[int], Any]):

@@ -54,7 +54,8 @@ def train_seeds(
     number = len(seeds)
     configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
     with contextlib.closing(make_env(config, 1, 0)) as env:
-        agent = make_agent(config, int(env.single_action_space.n))
+        frame, num_actions = env.single_observation_space.shape, int(env.single_action_space.n)
+    agent = make_agent(config, frame, num_actions)
     lockstep = Lockstep(agent, number)
 
     def one(i: int) -> Result:

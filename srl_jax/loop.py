@@ -40,9 +40,9 @@ class Result(NamedTuple):
     Attributes:
         env_steps, updates: done.
         interrupted: whether it was stopped before its end; its checkpoint is of that moment.
-        pictures: {objective: (inputs, targets, outputs)}, float32 [B, H, W, S] each, of objectives that
-            have one.
-        recording: uint8 [T, H, W], the first games of the last evaluation; None without one.
+        pictures: {objective: (inputs, targets, outputs)}, float32 [B, H, W, C] each, of objectives that
+            have one: of each observation the newest frame.
+        recording: uint8 [T, H, W, C], the first games of the last evaluation; None without one.
     """
 
     env_steps: int
@@ -155,7 +155,7 @@ def load_encoder(path: str | Path) -> tuple[Encoder, Params, checkpoint.Manifest
     """The encoder of a run, of one of its checkpoints, or one that was kept, `RUN/encoders/ENV_STEPS`.
 
         encoder, params, manifest = load_encoder("runs/pong/encoders/000002000")
-        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S] -> float32 [B, encoder.features]
+        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S * C] -> float32 [B, D]
 
     Raises:
         srl_jax.errors.ConfigError: there is none, it is damaged, or does not fit this code.
@@ -168,7 +168,7 @@ def load_encoder(path: str | Path) -> tuple[Encoder, Params, checkpoint.Manifest
 def _agent_of(manifest: checkpoint.Manifest) -> tuple[Agent, Any]:
     """The agent of a checkpoint's configuration, and the shapes of its parameters."""
     try:
-        agent = make_agent(manifest.config, manifest.num_actions)
+        agent = make_agent(manifest.config, manifest.frame_shape, manifest.num_actions)
         return agent, agent.shapes().params
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{manifest.path}: {error}") from None
@@ -199,11 +199,11 @@ class Run:
         self.env_thread = yielding_thread("environments")
         self.env = self.env_thread.submit(self.make_env, "train", config.num_envs).result()
         self.num_actions = int(self.env.single_action_space.n)
-        self.agent = agent or make_agent(config, self.num_actions)
+        frame = self.env.single_observation_space.shape
+        self.agent = agent or make_agent(config, frame, self.num_actions)
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.key = jax.random.key(config.seed)
         self.state = self.agent.init(self.key, self.initial_params() if resume is None else None)
-        frame = self.env.single_observation_space.shape
         try:
             self.replay = Replay(
                 capacity=config.buffer_size,
@@ -494,6 +494,7 @@ class Run:
             self.out,
             self.state.params,
             self.config,
+            frame_shape=self.replay.frame_shape,
             num_actions=self.num_actions,
             env_steps=self.env_steps,
             updates=self.updates,
@@ -525,6 +526,7 @@ class Run:
             self.out,
             params,
             self.config,
+            frame_shape=self.replay.frame_shape,
             num_actions=self.num_actions,
             env_steps=self.env_steps,
             updates=self.updates,
@@ -544,9 +546,12 @@ class Run:
             return {name: image(params[name], latents, window) for name, image in drawn.items()}
 
         made = jax.device_get(jax.jit(draw)(self.state.params, window))
-        stack = self.config.frame_stack
-        inputs = np.moveaxis(window.frames[:, :stack], 1, -1).astype(np.float32) / 255.0
-        return {name: (inputs, target, output) for name, (target, output) in made.items()}
+        inputs = window.frames[:, self.config.frame_stack - 1].astype(np.float32) / 255.0
+        newest = slice(-inputs.shape[-1], None)
+        return {
+            name: (inputs, target[..., newest], output[..., newest])
+            for name, (target, output) in made.items()
+        }
 
     # Starting
 
@@ -579,5 +584,10 @@ class Run:
             raise ConfigError(
                 f"--policy_from={self.config.policy_from}: its policy has {manifest.num_actions} actions, "
                 f"{self.config.game} has {self.num_actions}"
+            )
+        if manifest.frame_shape != self.replay.frame_shape:
+            raise ConfigError(
+                f"--policy_from={self.config.policy_from}: its policy sees frames of "
+                f"{list(manifest.frame_shape)}, {self.config.game} shows {list(self.replay.frame_shape)}"
             )
         return greedy_policy(agent, params, named_key(self.key, "given policy"))

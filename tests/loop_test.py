@@ -165,7 +165,7 @@ def test_rows_of_a_run(joint):
 def test_pictures_show_input_target_and_output(joint):
     _, result = joint
     (inputs, targets, outputs) = result.pictures["reconstruction"]
-    assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 42, 4)
+    assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 42, 1)
     np.testing.assert_allclose(inputs, targets, atol=1e-7)  # reconstruction's target is its input
     assert 0 <= inputs.min() and inputs.max() <= 1
 
@@ -175,7 +175,7 @@ def test_the_last_evaluation_was_recorded(joint):
     last = read_metrics(path / "metrics.jsonl")[-1]
     # Three games, one in each environment: the first one's frames, and the one that it began with.
     assert result.recording.dtype == np.uint8
-    assert result.recording.shape == (last["eval/lengths"][0] + 1, 42, 42)
+    assert result.recording.shape == (last["eval/lengths"][0] + 1, 42, 42, 1)
 
 
 def test_an_agent_comes_back_from_its_checkpoint(joint):

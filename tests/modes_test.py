@@ -45,7 +45,7 @@ def small(mode, **values):
 @functools.cache
 def build(mode):
     """(agent, its update compiled quickly, an initial state on the host) of a small configuration."""
-    agent = make_agent(small(mode), NUM_ACTIONS)
+    agent = make_agent(small(mode), (FRAME, FRAME, 1), NUM_ACTIONS)
     return agent, jit(agent.update.pure), random_state(agent.init)
 
 
@@ -175,7 +175,7 @@ def test_no_td_error_without_rl():
 
 
 def test_an_update_of_rl_alone_takes_over_and_returns_only_what_it_moves():
-    agent = make_agent(small("joint", srl_every=2), NUM_ACTIONS)
+    agent = make_agent(small("joint", srl_every=2), (FRAME, FRAME, 1), NUM_ACTIONS)
     state = jax.tree.map(jax.numpy.asarray, random_state(agent.init))
     before = jax.tree.map(np.array, state.params)
     new, _, _ = agent.update_rl(state, WINDOW, agent.hyper)
@@ -198,7 +198,7 @@ def test_everything_is_float32_also_where_jax_may_use_64_bits(mode):
     for encoder, name in pairs:
         with jax.enable_x64(True):
             values = {"encoder": encoder, "rl": name, "mode": mode, "max_grad_norm": 1.0}
-            agent = make_agent(Config(objectives=terms, **values), NUM_ACTIONS)
+            agent = make_agent(Config(objectives=terms, **values), (84, 84, 1), NUM_ACTIONS)
             state = jax.eval_shape(agent.init.__wrapped__, jax.random.key(0))
             window = make_window(horizon=agent.horizon, size=84)
             after = jax.eval_shape(agent.update.pure, state, window, agent.hyper)

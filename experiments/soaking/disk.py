@@ -124,6 +124,7 @@ def save(run, state) -> None:
         run.out,
         run.state.params,
         run.config,
+        frame_shape=run.replay.frame_shape,
         num_actions=run.num_actions,
         env_steps=run.env_steps + STEPS_BETWEEN,
         updates=run.updates,

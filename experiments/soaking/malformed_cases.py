@@ -87,10 +87,12 @@ def make_valid_run(run: Path) -> None:
     run.mkdir(parents=True)
     with mock.patch.dict(os.environ, JAX_PLATFORMS="cpu"):  # as the cases' processes have it
         config.save(run)
-    agent = make_agent(config, NUM_ACTIONS)
+    frame = (config.frame_size, config.frame_size, 1)
+    agent = make_agent(config, frame, NUM_ACTIONS)
     shapes = jax.eval_shape(agent.init, jax.random.key(0)).params
     params = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes)
-    checkpoint.save(run, params, config, num_actions=NUM_ACTIONS, env_steps=1000, updates=100)
+    about = {"frame_shape": frame, "num_actions": NUM_ACTIONS, "env_steps": 1000, "updates": 100}
+    checkpoint.save(run, params, config, **about)
     with MetricsWriter(run / "metrics.jsonl") as writer:
         for step in (0, 1000):
             writer.write("train", step, step // 10, 1.0, {"loss/rl": 1.0 + step, "grad_norm/rl": 0.5})

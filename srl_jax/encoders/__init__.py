@@ -1,6 +1,6 @@
 """The encoders: `REGISTRY[name](observation_shape, **options) -> Encoder`, a row each.
 
-`observation_shape` is (H, W, S). Each comes with the decoder that mirrors it, and all have the options
+`observation_shape` is (H, W, S * C). Each comes with the decoder that mirrors it, and all have the options
 `init`, `zero_sum`, `gain` and `decoder_scale`: see `srl_jax.encoders.convolutional.Start`.
 """
 
