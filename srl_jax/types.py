@@ -54,7 +54,8 @@ class Encoder(NamedTuple):
         features: D.
         observation_shape: (H, W, S * C).
         make_decoder: (extra_inputs: int = 0) -> Decoder; its input is the latent joined with that many
-            more numbers (a one-hot action, say).
+            more numbers (a one-hot action, say). Raises ValueError where the encoder has no decoder.
+        map_shape: (H', W', C') of the maps before they are flattened; None where it is not known.
     """
 
     init: Callable
@@ -62,6 +63,7 @@ class Encoder(NamedTuple):
     features: int
     observation_shape: tuple
     make_decoder: Callable
+    map_shape: tuple | None = None
 
 
 class Decoder(NamedTuple):

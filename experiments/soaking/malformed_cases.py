@@ -525,7 +525,6 @@ def _together() -> Iterator[Case]:
         "a buffer larger than memory": ("--buffer_size=2000000000", "--buffer_size"),
         "frames that Catch does not know": ("--frame_size=50", "--frame_size=50"),
         "frames that are too small": ("--game=Pong", "--frame_size=8", "--encoder"),
-        "frames that the encoder leaves out": ("--game=Pong", "--frame_size=90", "--encoder"),
         "an encoder for rl_only": ("--encoder_from=.", "--encoder_from"),
         "no encoder for frozen": ("--mode=frozen", "--encoder_from"),
         "an objective for rl_only": ("--objective=inverse", "--objective"),

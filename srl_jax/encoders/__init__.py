@@ -4,11 +4,13 @@
 `init`, `zero_sum`, `gain` and `decoder_scale`: see `srl_jax.encoders.convolutional.Start`.
 """
 
+from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder
+from srl_jax.encoders.impala import impala
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
-__all__ = ["REGISTRY", "nature", "sac_ae", "tiny"]
+__all__ = ["REGISTRY", "flax_encoder", "impala", "nature", "sac_ae", "tiny"]
 
 
 def nature(
@@ -76,4 +78,4 @@ def tiny(
     return convolutional_encoder(observation_shape, layers, start, features=features)
 
 
-REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny}
+REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny, "impala": impala}
