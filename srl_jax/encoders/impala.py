@@ -87,7 +87,7 @@ class ImpalaDecoder(nn.Module):
 def halved(x: Array) -> Array:
     """The maximum of 3 x 3 pixels around every second one: [B, H, W, C] -> [B, ceil(H / 2), ceil(W / 2), C].
 
-    As `flax.linen.max_pool(x, (3, 3), (2, 2), "SAME")`, whose gradient takes XLA on a CPU 5 to 13 times as
+    As `flax.linen.max_pool(x, (3, 3), (2, 2), "SAME")`, whose gradient takes XLA on a CPU 5 to 27 times as
     long. Pixels that share a maximum share its gradient.
     """
     for axis in (1, 2):
