@@ -1,7 +1,7 @@
 """The encoders: `REGISTRY[name](observation_shape, **options) -> Encoder`, a row each.
 
-`observation_shape` is (H, W, S * C), of any size from the least that the layers fit. Each comes with the decoder
-that mirrors it, and all have the options `init`, `zero_sum`, `gain` and `decoder_scale`: see
+`observation_shape` is (H, W, S * C), of any size from the least that the layers fit. Each comes with the
+decoder that mirrors it, and all have the options `init`, `zero_sum`, `gain` and `decoder_scale`: see
 `srl_jax.encoders.convolutional.Start`. `flax_encoder` makes an encoder of any flax module.
 """
 
