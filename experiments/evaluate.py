@@ -81,11 +81,8 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
             f"{manifest.path}: its policy has {manifest.num_actions} actions, {config.game} has "
             f"{env.single_action_space.n}"
         )
-    if manifest.frame_shape != env.single_observation_space.shape:
-        raise ConfigError(
-            f"{manifest.path}: its policy sees frames of {list(manifest.frame_shape)}, {config.game} shows "
-            f"{list(env.single_observation_space.shape)}"
-        )
+    shape = env.single_observation_space.shape
+    checkpoint.check_frames(manifest, shape, str(manifest.path), config.game)
     played = evaluate(
         loop.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
         env,

@@ -591,6 +591,22 @@ def check_sources(config: Config) -> None:
         _same("policy_from", config, found, "frame_stack", "the preprocessing")
 
 
+def check_frames(manifest: Manifest, frame_shape: tuple, what: str, game: str) -> None:
+    """Whether a checkpoint's encoder has seen frames of the shape (H, W, C) that a game shows.
+
+    Args:
+        manifest: of the checkpoint.
+        frame_shape: of the game's frames.
+        what, game: names of both, for the error.
+
+    Raises:
+        ConfigError: it has not; convolutions would take other frames without complaint.
+    """
+    if manifest.frame_shape != frame_shape:
+        seen, shown = list(manifest.frame_shape), list(frame_shape)
+        raise ConfigError(f"{what}: its encoder sees frames of {seen}, {game} shows {shown}")
+
+
 def _source(flag: str, path: str) -> Manifest:
     try:
         return read_manifest(path)

@@ -566,7 +566,9 @@ class Run:
         config = self.config
         if not config.encoder_from:
             return {}
-        found = checkpoint.load(checkpoint.read_manifest(config.encoder_from))
+        manifest = checkpoint.read_manifest(config.encoder_from)
+        self.check_frames("encoder_from", manifest)
+        found = checkpoint.load(manifest)
         template = self.agent.shapes().params
         wanted = {"representation": template.keys() - {RL}, "all": template.keys(), "none": {ENCODER}}
         names = sorted(wanted[config.heads_from] & found.keys())
@@ -577,6 +579,11 @@ class Run:
             f"--encoder_from={config.encoder_from}{hint}",
         )
 
+    def check_frames(self, flag: str, manifest: checkpoint.Manifest) -> None:
+        """Whether what the flag names has seen such frames as this run's environments show."""
+        what, game = f"--{flag}={getattr(self.config, flag)}", self.config.game
+        checkpoint.check_frames(manifest, self.env.single_observation_space.shape, what, game)
+
     def given_policy(self) -> Policy:
         """The policy of `policy_from`, without noise."""
         agent, params, manifest = load_agent(self.config.policy_from)
@@ -585,9 +592,5 @@ class Run:
                 f"--policy_from={self.config.policy_from}: its policy has {manifest.num_actions} actions, "
                 f"{self.config.game} has {self.num_actions}"
             )
-        if manifest.frame_shape != self.replay.frame_shape:
-            raise ConfigError(
-                f"--policy_from={self.config.policy_from}: its policy sees frames of "
-                f"{list(manifest.frame_shape)}, {self.config.game} shows {list(self.replay.frame_shape)}"
-            )
+        self.check_frames("policy_from", manifest)
         return greedy_policy(agent, params, named_key(self.key, "given policy"))

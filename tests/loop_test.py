@@ -456,9 +456,10 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
     # No environment is needed to know it.
     loaded, _, manifest = loop.load_agent(path)
     assert manifest.frame_shape == (42, 50, 3) and loaded.encoder.observation_shape == (42, 50, 12)
-    grey = Config(**{**SMALL, "mode": "pretrain", "objectives": ("latent_l2",), "policy_from": str(path)})
-    with pytest.raises(ConfigError, match=r"sees frames of \[42, 50, 3\], Catch shows \[42, 42, 1\]"):
-        loop.Run(grey, tmp_path, progress=False)
+    for flag in ("policy_from", "encoder_from"):
+        grey = Config(**{**SMALL, "mode": "pretrain", "objectives": ("latent_l2",), flag: str(path)})
+        with pytest.raises(ConfigError, match=rf"--{flag}=.* of \[42, 50, 3\], Catch shows \[42, 42, 1\]"):
+            loop.Run(grey, tmp_path, progress=False)
 
 
 def test_early_stop(tmp_path):
