@@ -35,7 +35,7 @@ from srl_jax.specs import LIMITS
 
 MANIFEST, CHECKSUM, PARAMS, NUMBERS = "manifest.json", "manifest.sha256", "params.msgpack", "run.json"
 FORMAT = 4
-LARGEST_SIDE = 1 << 16  # of a frame; nobody's memory is asked for more
+LARGEST_SIDE = 1 << 12  # of a frame, in pixels
 _NAME = re.compile(r"[a-z0-9_]+\.(msgpack|npy|json)")
 _DTYPES = frozenset(np.dtype(code).str for code in "?bhiqBHIQefd")  # of numbers, as numpy writes them
 _PIECE = 1 << 24  # bytes that are written, or read to be summed, at a time

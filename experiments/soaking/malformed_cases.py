@@ -577,6 +577,10 @@ def _manifests() -> Iterator[Case]:
     values = {
         "format": (99, "1", None, True, -1, huge, [], KeyError),
         "num_actions": ("3", 3.5, True, None, -1, 0, huge, 1_000_000_000, 2, [3], KeyError),
+        "frame_shape": (
+            None, "42", [42, 42], [42, 42, 0], [42, 42, True], [8, 8, 1], [42, 42, 3], [4096] * 3, [huge] * 3,
+            KeyError,
+        ),
         "env_steps": ("1000", 1000.5, None, -1, huge, KeyError),
         "updates": ("x", {}, -1, huge, KeyError),
         "files": ([], {}, None, "params.msgpack", ["params.msgpack"], 1, KeyError),

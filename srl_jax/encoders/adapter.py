@@ -30,7 +30,7 @@ def flax_encoder(
         ValueError: the network's output is not [B, D], or it has other variables than parameters. Of the
             decoder's, when one is made.
     """
-    image = jnp.zeros((1, *shape), jnp.float32)
+    image = jax.ShapeDtypeStruct((1, *shape), jnp.float32)
     latent = _checked(network, image)
     if len(latent.shape) != 2:
         raise ValueError(f"{_name(network)} must give latents [B, D], not {_text(latent.shape)}")
@@ -39,7 +39,7 @@ def flax_encoder(
     def make_decoder(extra_inputs: int = 0) -> Decoder:
         if decoder_network is None:
             raise ValueError(f"the encoder {_name(network)} has no decoder, which this objective needs")
-        z = jnp.zeros((1, features + extra_inputs), jnp.float32)
+        z = jax.ShapeDtypeStruct((1, features + extra_inputs), jnp.float32)
         output = _checked(decoder_network, z)
         if output.shape != image.shape:
             wanted, given = _text(image.shape), _text(output.shape)
@@ -50,11 +50,11 @@ def flax_encoder(
     return Encoder(init, apply, features, tuple(shape), make_decoder, map_shape)
 
 
-def _functions(network: nn.Module, example: Array) -> tuple[Callable, Callable]:
+def _functions(network: nn.Module, example: jax.ShapeDtypeStruct) -> tuple[Callable, Callable]:
     """key -> params, and (params, inputs) -> outputs."""
 
     def init(key: Array) -> Params:
-        return network.init(key, example).get("params", {})
+        return network.init(key, jnp.zeros(example.shape, example.dtype)).get("params", {})
 
     def apply(params: Params, x: Array) -> Array:
         return network.apply({"params": params}, x)
@@ -62,8 +62,8 @@ def _functions(network: nn.Module, example: Array) -> tuple[Callable, Callable]:
     return init, apply
 
 
-def _checked(network: nn.Module, example: Array) -> jax.ShapeDtypeStruct:
-    """What the network gives for an input; compiles nothing."""
+def _checked(network: nn.Module, example: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    """What the network gives for an input; compiles nothing, and takes no memory."""
     output, variables = jax.eval_shape(network.init_with_output, jax.random.key(0), example)
     if others := variables.keys() - {"params"}:
         raise ValueError(
