@@ -23,7 +23,7 @@ from srl_jax.specs import LIMITS
 FLAGS = flags.FLAGS
 
 GIF_SIZE = 84
-"""Pixels: height and width of play.gif, where frames are smaller by a whole factor."""
+"""Pixels: the longer side of play.gif, where frames are smaller by a whole factor."""
 
 
 def draw_run(
@@ -41,7 +41,7 @@ def draw_run(
         config: of the run.
         thesis: FIGURE/ARM, a curve of the thesis to draw beside the run's own; empty for none.
         pictures: {objective: (inputs, targets, outputs)}, see `srl_jax.loop.Result`.
-        recording: uint8 [T, H, W], likewise; play.gif.
+        recording: uint8 [T, H, W, C], likewise; play.gif.
 
     Returns:
         The files written; empty if matplotlib is not installed.
@@ -68,7 +68,7 @@ def draw_run(
         path = figures / f"{name}.png"
         written.append(plots.image_panel(inputs, targets, outputs, path, f"{title}: {name}"))
     if recording is not None:
-        scale = max(1, GIF_SIZE // recording.shape[1])
+        scale = max(1, GIF_SIZE // max(recording.shape[1:3]))
         written.append(plots.gif(recording, figures / "play.gif", scale=scale))
     return [path for path in written if path]
 

@@ -81,6 +81,8 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
             f"{manifest.path}: its policy has {manifest.num_actions} actions, {config.game} has "
             f"{env.single_action_space.n}"
         )
+    shape = env.single_observation_space.shape
+    checkpoint.check_frames(manifest, shape, str(manifest.path), config.game)
     played = evaluate(
         loading.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
         env,

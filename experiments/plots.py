@@ -18,6 +18,7 @@ STEPS_LABEL = "env steps"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette: distinguishable to colour-blind readers."""
 MAX_EXAMPLES = 6
+CHANNELS = (1, 3)  # of an image that can be shown: grey, or red, green and blue
 NEAR = 0.02
 """Of an axis: reference policies that are as near to each other as that share a line."""
 
@@ -152,10 +153,11 @@ def image_panel(
 ) -> Path:
     """Draws examples in rows: input, target, output, and how far the output is from the target.
 
-    Of each stack the newest frame is shown.
+    Three channels are shown in colour; the difference is then the largest of the three.
 
     Args:
-        inputs: float [B, H, W, S] in [0, 1]; what the encoder saw. The first 6 examples are drawn.
+        inputs: float [B, H, W, C] in [0, 1], C of 1 or 3; the newest frame that the encoder saw. The first 6
+            examples are drawn.
         targets: likewise; what the output should be.
         outputs: likewise; may leave [0, 1], which is shown clipped; the difference is not clipped.
         path: of the PNG file.
@@ -167,25 +169,29 @@ def image_panel(
     Raises:
         ValueError: if the shapes differ or the images are not float.
     """
-    stacks = [np.asarray(stack) for stack in (inputs, targets, outputs)]
-    if len({stack.shape for stack in stacks}) > 1 or stacks[0].ndim != 4 or not stacks[0].size:
-        shapes = ", ".join(str(stack.shape) for stack in stacks)
-        raise ValueError(f"image stacks must be [B, H, W, S], all of one shape; got {shapes}")
-    if not all(np.issubdtype(stack.dtype, np.floating) for stack in stacks):
-        raise ValueError("image stacks must be float in [0, 1]")
-    newest = [stack[:MAX_EXAMPLES, :, :, -1].astype(np.float32) for stack in stacks]
-    difference = np.abs(newest[2] - newest[1])
+    given = [np.asarray(images) for images in (inputs, targets, outputs)]
+    alike = len({images.shape for images in given}) == 1
+    if not alike or given[0].ndim != 4 or given[0].shape[3] not in CHANNELS or not given[0].size:
+        shapes = ", ".join(str(images.shape) for images in given)
+        raise ValueError(f"images must be [B, H, W, 1] or [B, H, W, 3], all of one shape; got {shapes}")
+    if not all(np.issubdtype(images.dtype, np.floating) for images in given):
+        raise ValueError("images must be float in [0, 1]")
+    shown = [images[:MAX_EXAMPLES].astype(np.float32) for images in given]
+    difference = np.abs(shown[2] - shown[1]).max(-1, keepdims=True)
     top = float(difference.max()) or 1.0
 
     count = len(difference)
     figure = new_figure(1.15 * 4 + 0.9, 1.15 * count + 0.75)
     axes = figure.subplots(count, 4, squeeze=False)
     names = ("input", "target", "output", "|output - target|")
-    for column, (name, images) in enumerate(zip(names, [*newest, difference], strict=True)):
+    for column, (name, images) in enumerate(zip(names, [*shown, difference], strict=True)):
         last = column == 3
         for i, image in enumerate(images):
             drawn = axes[i, column].imshow(
-                image, cmap="inferno" if last else "gray", vmin=0, vmax=top if last else 1
+                image[..., 0] if image.shape[-1] == 1 else image.clip(0, 1),
+                cmap="inferno" if last else "gray",
+                vmin=0,
+                vmax=top if last else 1,
             )
             axes[i, column].set_axis_off()
         axes[0, column].set_title(name, fontsize=9)
@@ -200,7 +206,7 @@ def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int
     """Writes frames as a GIF that repeats for ever.
 
     Args:
-        frames: uint8 [T, H, W] (grey) or [T, H, W, 3] (RGB), T at least 1.
+        frames: uint8 [T, H, W, C], C of 1 (grey) or 3 (RGB), T at least 1.
         path: of the file.
         fps: frames a second; a GIF counts in hundredths of a second, and is rounded to them.
         scale: every pixel becomes a square of this many pixels a side.
@@ -214,13 +220,13 @@ def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int
     from PIL import Image
 
     frames = np.asarray(frames)
-    grey = frames.ndim == 3
-    if frames.dtype != np.uint8 or not (grey or (frames.ndim == 4 and frames.shape[3] == 3)):
-        raise ValueError(f"frames must be uint8 [T, H, W] or [T, H, W, 3]; got {frames.dtype} {frames.shape}")
+    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] not in CHANNELS:
+        got = f"{frames.dtype} {frames.shape}"
+        raise ValueError(f"frames must be uint8 [T, H, W, 1] or [T, H, W, 3]; got {got}")
     if not len(frames):
         raise ValueError("a GIF needs at least one frame")
     images = [
-        Image.fromarray(frame).resize(
+        Image.fromarray(frame[..., 0] if frame.shape[-1] == 1 else frame).resize(
             (frame.shape[1] * scale, frame.shape[0] * scale), Image.Resampling.NEAREST
         )
         for frame in frames

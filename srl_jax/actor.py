@@ -14,36 +14,36 @@ from srl_jax import envs
 from srl_jax.config import Config
 
 Policy = Callable[[np.ndarray, int, float], np.ndarray]
-"""(frames uint8 [N, S, H, W], step, epsilon) -> actions int32 [N]; its draws depend on the step."""
+"""(frames uint8 [N, S, H, W, C], step, epsilon) -> actions int32 [N]; its draws depend on the step."""
 
 
 class FrameStack:
     """The last S frames of N environments; an episode's first frame stands in for those before it.
 
     Attributes:
-        frames: uint8 [N, S, H, W], newest last; all the state there is.
+        frames: uint8 [N, S, H, W, C], newest last; all the state there is.
 
     Args:
         num_envs: N.
         stack: S.
-        frame_shape: (H, W).
+        frame_shape: (H, W, C).
     """
 
     def __init__(self, num_envs: int, stack: int, frame_shape: tuple):
         self.frames = np.zeros((num_envs, stack, *frame_shape), np.uint8)
 
     def begin(self, frames: np.ndarray, mask: np.ndarray | None = None) -> None:
-        """Starts episodes from frames uint8 [N, H, W], where mask bool [N] says so (None: everywhere)."""
+        """Starts episodes from frames uint8 [N, H, W, C], where mask bool [N] says so (None: everywhere)."""
         mask = np.ones(len(frames), bool) if mask is None else mask
         self.frames[mask] = frames[mask][:, None]
 
     def push(self, frames: np.ndarray) -> None:
-        """Adds the next frame of every environment, uint8 [N, H, W]."""
+        """Adds the next frame of every environment, uint8 [N, H, W, C]."""
         self.frames[:, :-1] = self.frames[:, 1:]
         self.frames[:, -1] = frames
 
     def observations(self) -> np.ndarray:
-        """uint8 [N, S, H, W], newest last: a fresh array, since jax may go on reading what it was handed."""
+        """uint8 [N, S, H, W, C], newest last: a fresh array, as jax may go on reading what it was handed."""
         return self.frames.copy()
 
 

@@ -108,18 +108,20 @@ class Agent(NamedTuple):
     measures: Functions
 
 
-def make_agent(config: Config, num_actions: int) -> Agent:
+def make_agent(config: Config, frame_shape: tuple, num_actions: int) -> Agent:
     """Builds an `Agent`.
 
     Args:
         config: a run's.
+        frame_shape: (H, W, C) of its environments' frames.
         num_actions: of its game.
 
     Raises:
         srl_jax.specs.SpecError: where a spec does not fit.
     """
     mode = MODES[config.mode]
-    shape = (config.frame_size, config.frame_size, config.frame_stack)
+    height, width, channels = frame_shape
+    shape = (height, width, config.frame_stack * channels)
     encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
     context = Context.of(encoder, num_actions)
     algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
@@ -191,7 +193,12 @@ def make_agent(config: Config, num_actions: int) -> Agent:
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},
         ),
         measures=make_functions(
-            encoder, terms, mode, augment=config.augment, target_encoder=config.target_encoder
+            encoder,
+            terms,
+            mode,
+            channels=channels,
+            augment=config.augment,
+            target_encoder=config.target_encoder,
         ),
     )
 

@@ -13,14 +13,14 @@ def random_shift(frames: Array, key: Array, pad: int = 4) -> Array:
     sequence, so that what moves in it is what moved in the game.
 
     Args:
-        frames: any dtype, [T, H, W], one row's frames.
+        frames: any dtype, [T, H, W, C], one row's frames.
         key: a jax key.
         pad: the largest shift, in pixels.
 
     Returns:
         The same shape and dtype.
     """
-    height, width = frames.shape[-2:]
+    height, width = frames.shape[1:3]
     dy, dx = jax.random.randint(key, (2,), -pad, pad + 1)
     rows = jnp.clip(jnp.arange(height) + dy, 0, height - 1)
     columns = jnp.clip(jnp.arange(width) + dx, 0, width - 1)

@@ -34,7 +34,8 @@ from srl_jax.reading import parse_json
 from srl_jax.specs import LIMITS
 
 MANIFEST, CHECKSUM, PARAMS, NUMBERS = "manifest.json", "manifest.sha256", "params.msgpack", "run.json"
-FORMAT = 3
+FORMAT = 4
+LARGEST_SIDE = 1 << 12  # of a frame, in pixels
 _NAME = re.compile(r"[a-z0-9_]+\.(msgpack|npy|json)")
 _DTYPES = frozenset(np.dtype(code).str for code in "?bhiqBHIQefd")  # of numbers, as numpy writes them
 _PIECE = 1 << 24  # bytes that are written, or read to be summed, at a time
@@ -60,6 +61,7 @@ class Manifest(NamedTuple):
     Attributes:
         path: its directory.
         config: of the run that wrote it, resolved.
+        frame_shape: (H, W, C) of that run's frames.
         num_actions: of that run's game.
         env_steps, updates: when it was written.
         files: {name: Entry}, of every file but the manifest and its sum.
@@ -67,6 +69,7 @@ class Manifest(NamedTuple):
 
     path: Path
     config: Config
+    frame_shape: tuple[int, int, int]
     num_actions: int
     env_steps: int
     updates: int
@@ -94,6 +97,7 @@ def save(
     params: Any,
     config: Config,
     *,
+    frame_shape: tuple[int, int, int],
     num_actions: int,
     env_steps: int,
     updates: int,
@@ -110,7 +114,7 @@ def save(
     Args:
         run: the run directory.
         params: {"encoder": tree, OBJECTIVE: tree}.
-        config, num_actions, env_steps, updates: see `Manifest`.
+        config, frame_shape, num_actions, env_steps, updates: see `Manifest`.
         state: what else is needed to go on; None where nobody will.
         base: the run's last checkpoint, whose files stand in for `state.unchanged`.
         keep: how many checkpoints stay, up to this one; 0 for all.
@@ -131,7 +135,8 @@ def save(
             shutil.rmtree(left)
         temporary.mkdir()
         files = _write_files(temporary, params, state, base)
-        about = {"format": FORMAT, "num_actions": num_actions, "env_steps": env_steps, "updates": updates}
+        about = {"format": FORMAT, "frame_shape": list(frame_shape), "num_actions": num_actions}
+        about |= {"env_steps": env_steps, "updates": updates}
         about["files"] = {name: _about(entry) for name, entry in files.items()}
         about["config"] = json.loads(config.to_json())
         sign(temporary, about)
@@ -144,7 +149,7 @@ def save(
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise SaveError(f"{final}: not written: {error.strerror or error}") from error
-    return Manifest(final, config, num_actions, env_steps, updates, files)
+    return Manifest(final, config, tuple(frame_shape), num_actions, env_steps, updates, files)
 
 
 def _write_files(folder: Path, params: Any, state: State | None, base: Manifest | None) -> dict[str, Entry]:
@@ -284,6 +289,9 @@ def read_manifest(path: str | Path) -> Manifest:
         numbers = [content[name] for name in ("num_actions", "env_steps", "updates")]
         if not all(type(number) is int and 0 <= number <= LIMITS[int] for number in numbers):
             raise ValueError("counts are not whole numbers")
+        shape = tuple(content["frame_shape"])
+        if len(shape) != 3 or not all(type(side) is int and 1 <= side <= LARGEST_SIDE for side in shape):
+            raise ValueError("frame_shape is not height, width and channels")
         files = {name: _entry(name, about) for name, about in content["files"].items()}
         if PARAMS not in files:
             raise ValueError(f"no {PARAMS}")
@@ -293,7 +301,7 @@ def read_manifest(path: str | Path) -> Manifest:
             raise
         raise ConfigError(f"{path / MANIFEST}: damaged ({_line(error)})") from None
     try:
-        return Manifest(path, Config.from_json(config), *numbers, files)
+        return Manifest(path, Config.from_json(config), shape, *numbers, files)
     except (ConfigError, OverflowError) as error:
         raise ConfigError(f"{path / MANIFEST}: {error}") from None
 
@@ -608,6 +616,22 @@ def check_sources(config: Config) -> None:
         _same("policy_from", config, found, "game", "the game")
         _same("policy_from", config, found, "frame_size", "the preprocessing")
         _same("policy_from", config, found, "frame_stack", "the preprocessing")
+
+
+def check_frames(manifest: Manifest, frame_shape: tuple, what: str, game: str) -> None:
+    """Whether a checkpoint's encoder has seen frames of the shape (H, W, C) that a game shows.
+
+    Args:
+        manifest: of the checkpoint.
+        frame_shape: of the game's frames.
+        what, game: names of both, for the error.
+
+    Raises:
+        ConfigError: it has not; convolutions would take other frames without complaint.
+    """
+    if manifest.frame_shape != frame_shape:
+        seen, shown = list(manifest.frame_shape), list(frame_shape)
+        raise ConfigError(f"{what}: its encoder sees frames of {seen}, {game} shows {shown}")
 
 
 def _source(flag: str, path: str) -> Manifest:

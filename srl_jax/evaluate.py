@@ -14,8 +14,8 @@ class Evaluation(NamedTuple):
     Attributes:
         returns: the raw score of each game, undiscounted.
         lengths: env steps of each game.
-        frames: uint8 [T, H, W], the first environment's games as they were seen, one after the other; empty
-            unless asked for.
+        frames: uint8 [T, H, W, C], the first environment's games as they were seen, one after the other;
+            empty unless asked for.
     """
 
     returns: list[float]

@@ -6,6 +6,7 @@ slower than the same layer written as a pad and a VALID convolution.
 """
 
 import math
+from collections.abc import Sequence
 from functools import partial
 
 import flax.linen as nn
@@ -15,6 +16,8 @@ from jax.custom_derivatives import SymbolicZero
 
 from srl_jax.types import Array
 
+Padding = str | int | tuple[tuple[int, int], tuple[int, int]]
+"""See `Conv.padding`."""
 FEW_ROWS = 16
 """A noisy layer of no more rows multiplies by mu and by sigma, and does not write down their noisy sum."""
 
@@ -113,7 +116,7 @@ class WideDense(nn.Module):
 
 
 class Conv(nn.Module):
-    """A VALID convolution, float32 or uint8 [B, H, W, C] -> float32 [B, H', W', features].
+    """A convolution, float32 or uint8 [B, H, W, C] -> float32 [B, H', W', features].
 
     Attributes:
         features: output channels.
@@ -121,6 +124,9 @@ class Conv(nn.Module):
         initial: a key of `INITIALISERS`.
         zero_sum: whether its kernels start with a sum of 0, see `zero_sum`.
         gain: factor of the input.
+        init_scale: factor of the kernel's initial values.
+        padding: zeros around the image: "VALID", none; "SAME", as many as make H' = ceil(H / stride), the odd
+            one below and on the right; an int, so many on every side; or ((above, below), (left, right)).
     """
 
     features: int
@@ -129,19 +135,42 @@ class Conv(nn.Module):
     initial: str = "pytorch"
     zero_sum: bool = False
     gain: float = 1.0
+    init_scale: float = 1.0
+    padding: Padding = "VALID"
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
         init, bias_init = INITIALISERS[self.initial](self.kernel**2 * x.shape[-1])
         if self.zero_sum:
             init = zero_sum(init)
+        init = scaled(init, self.init_scale)
         kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
         bias = self.param("bias", bias_init, (self.features,))
+        pads = padding_of(self.padding, x.shape[1:3], self.kernel, self.stride)
+        if any(map(any, pads)):
+            x = jnp.pad(x, [(0, 0), *pads, (0, 0)])
         return _valid_conv(x, kernel * self.gain, self.stride) + bias
 
 
+def padding_of(padding: Padding, sides: Sequence[int], kernel: int, stride: int) -> tuple:
+    """The zeros ((above, below), (left, right)) that a `Conv.padding` means for an image of sides H and W.
+
+    Raises:
+        ValueError: the padding is no such thing.
+    """
+    if padding == "VALID":
+        return (0, 0), (0, 0)
+    if padding == "SAME":
+        missing = [max(0, (-(-side // stride) - 1) * stride + kernel - side) for side in sides]
+        return tuple((n // 2, n - n // 2) for n in missing)
+    pads = ((padding, padding),) * 2 if isinstance(padding, int) else tuple(map(tuple, padding))
+    if [len(pair) for pair in pads] != [2, 2] or min(map(min, pads)) < 0:
+        raise ValueError(f"padding must be VALID, SAME, a number or two pairs of numbers, not {padding!r}")
+    return pads
+
+
 class ConvTranspose(nn.Module):
-    """A transposed convolution as a VALID one: float32 [B, h, w, C] -> [B, H, W, features].
+    """A transposed convolution as a VALID one: float32 [B, h, w, C] -> [B, *size, features].
 
     With stride s, output pixel `y * s + r` is `sum_j x[y - j] @ kernel[j * s + r]`: an ordinary convolution
     with ceil(kernel / s) taps and s * s * features channels, followed by depth-to-space. No zero is ever
@@ -151,8 +180,10 @@ class ConvTranspose(nn.Module):
         features: output channels.
         kernel: side of the kernel, in pixels; its parameter is [kernel, kernel, C, features].
         stride: the factor by which the image grows.
-        size: side of the output, in pixels; at least `(h - 1) * stride + kernel`, and less than `stride`
-            above it (what PyTorch calls output padding): what the mirrored layer saw.
+        size: height and width of the output, in pixels; each less than `stride` above or below
+            `(h - 1) * stride + kernel`: what the mirrored layer saw, which may have left out the last rows
+            and columns (PyTorch's output padding: the bias alone is there) or have had zeros below them (they
+            are cut off).
         initial: a key of `INITIALISERS`.
         init_scale: factor of the kernel's initial values.
     """
@@ -160,16 +191,16 @@ class ConvTranspose(nn.Module):
     features: int
     kernel: int
     stride: int
-    size: int
+    size: tuple[int, int]
     initial: str = "pytorch"
     init_scale: float = 1.0
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
         k, s, channels = self.kernel, self.stride, x.shape[-1]
-        height = x.shape[1]
-        if not 0 <= self.size - ((height - 1) * s + k) < s:
-            raise ValueError(f"a kernel of {k} with stride {s} cannot make {self.size} pixels from {height}")
+        for wanted, given in zip(self.size, x.shape[1:3], strict=True):
+            if not abs(wanted - ((given - 1) * s + k)) < s:
+                raise ValueError(f"a kernel of {k} with stride {s} cannot make {wanted} pixels from {given}")
         fan_in = max(1, k // s) ** 2 * channels  # the inputs that reach an output pixel
         init, bias_init = INITIALISERS[self.initial](fan_in)
         kernel = self.param("kernel", scaled(init, self.init_scale), (k, k, channels, self.features))
@@ -179,12 +210,10 @@ class ConvTranspose(nn.Module):
         kernel = kernel.reshape(taps, s, taps, s, channels, self.features)[::-1, :, ::-1]
         kernel = kernel.transpose(0, 2, 4, 1, 3, 5).reshape(taps, taps, channels, -1)
         x = _full_conv(x, kernel)
-        batch, rows = x.shape[:2]
-        x = x.reshape(batch, rows, rows, s, s, self.features).transpose(0, 1, 3, 2, 4, 5)
-        x = x.reshape(batch, rows * s, rows * s, self.features)
-        missing = max(0, self.size - rows * s)
-        x = jnp.pad(x, [(0, 0)] + [(0, missing)] * 2 + [(0, 0)])
-        return x[:, : self.size, : self.size] + bias
+        batch, rows, columns, _ = x.shape
+        x = x.reshape(batch, rows, columns, s, s, self.features).transpose(0, 1, 3, 2, 4, 5)
+        x = x.reshape(batch, rows * s, columns * s, self.features)
+        return _fitted(x, self.size) + bias
 
 
 def factorised_noise(key: Array, size: int) -> Array:
@@ -232,7 +261,7 @@ class NoisyDense(nn.Module):
 
 
 def _valid_conv(x: Array, kernel: Array, stride: int) -> Array:
-    """A VALID convolution of [B, H, W, C], H = W, with [k, k, C, features], as one of stride 1.
+    """A VALID convolution of [B, H, W, C] with [k, k, C, features], as one of stride 1.
 
     With stride s it is a convolution over blocks of s x s pixels, whose pixels are channels
     (space-to-depth). A kernel that is no multiple of s is padded with zeros. Three times as fast on a CPU,
@@ -241,8 +270,7 @@ def _valid_conv(x: Array, kernel: Array, stride: int) -> Array:
     if stride > 1:
         channels, k = x.shape[-1], kernel.shape[0]
         taps = -(-k // stride)
-        blocks = (x.shape[1] - k) // stride + taps
-        x = _pad_to(x, blocks * stride)
+        x = _fitted(x, [((side - k) // stride + taps) * stride for side in x.shape[1:3]])
         of_bytes = x.dtype == jnp.uint8
         x = _blocks_of_bytes(x, stride) if of_bytes else _blocks(x, stride)
         kernel = jnp.pad(kernel, [(0, taps * stride - k)] * 2 + [(0, 0)] * 2)
@@ -288,35 +316,36 @@ def _full_conv_jvp(primals, tangents):
     return y, y_dot
 
 
-def _pad_to(x: Array, size: int) -> Array:
-    """[B, H, H, C] cut or padded with zeros to [B, size, size, C]."""
-    x = x[:, :size, :size]
-    return jnp.pad(x, [(0, 0)] + [(0, size - x.shape[1])] * 2 + [(0, 0)])
+def _fitted(x: Array, size: Sequence[int]) -> Array:
+    """[B, H, W, C] cut or padded with zeros, below and on the right, to [B, *size, C]."""
+    height, width = size
+    x = x[:, :height, :width]
+    return jnp.pad(x, [(0, 0), (0, height - x.shape[1]), (0, width - x.shape[2]), (0, 0)])
 
 
 def _blocks(x: Array, s: int) -> Array:
-    """[B, H, H, C] -> [B, H / s, H / s, s * s * C]; channels stay together."""
-    batch, height, _, channels = x.shape
-    x = x.reshape(batch, height // s, s, height // s, s, channels).transpose(0, 1, 3, 2, 4, 5)
-    return x.reshape(batch, height // s, height // s, s * s * channels)
+    """[B, H, W, C] -> [B, H / s, W / s, s * s * C]; channels stay together."""
+    batch, height, width, channels = x.shape
+    x = x.reshape(batch, height // s, s, width // s, s, channels).transpose(0, 1, 3, 2, 4, 5)
+    return x.reshape(batch, height // s, width // s, s * s * channels)
 
 
 def _blocks_of_bytes(x: Array, s: int) -> Array:
-    """uint8 [B, H, H, C] -> uint8 [B, H / s, H / s, C * s * s]; the pixels of a row stay together.
+    """uint8 [B, H, W, C] -> uint8 [B, H / s, W / s, C * s * s]; the pixels of a row stay together.
 
-    Frames come from replay as [B, C, H, W], so those pixels are neighbours there, and moving them as one
+    Grey frames come from replay as [B, C, H, W], so those pixels are neighbours there, and moving them as one
     word of 2 or 4 bytes makes XLA's loop over an image ten times as fast on a CPU.
     """
-    batch, height, _, channels = x.shape
-    x = jnp.moveaxis(x, -1, 1).reshape(batch, channels, height // s, s, height // s, s)
-    width = next(n for n in (4, 2, 1) if s % n == 0)
-    word = {4: jnp.uint32, 2: jnp.uint16, 1: jnp.uint8}[width]
-    if width > 1:
-        x = jax.lax.bitcast_convert_type(x.reshape(*x.shape[:-1], s // width, width), word)
+    batch, height, width, channels = x.shape
+    x = jnp.moveaxis(x, -1, 1).reshape(batch, channels, height // s, s, width // s, s)
+    size = next(n for n in (4, 2, 1) if s % n == 0)
+    word = {4: jnp.uint32, 2: jnp.uint16, 1: jnp.uint8}[size]
+    if size > 1:
+        x = jax.lax.bitcast_convert_type(x.reshape(*x.shape[:-1], s // size, size), word)
     else:
         x = x[..., None]
     x = x.reshape(*x.shape[:5], -1)  # [B, C, rows of blocks, s, blocks of a row, words of a block's row]
     x = x.transpose(0, 2, 4, 1, 3, 5)
-    if width > 1:
+    if size > 1:
         x = jax.lax.bitcast_convert_type(x, jnp.uint8)
-    return x.reshape(batch, height // s, height // s, channels * s * s)
+    return x.reshape(batch, height // s, width // s, channels * s * s)

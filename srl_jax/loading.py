@@ -38,7 +38,7 @@ def load_encoder(path: str | Path) -> tuple[Encoder, Params, checkpoint.Manifest
     """The encoder of a run, of one of its checkpoints, or one that was kept, `RUN/encoders/ENV_STEPS`.
 
         encoder, params, manifest = load_encoder("runs/pong/encoders/000002000")
-        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S] -> float32 [B, encoder.features]
+        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S * C] -> float32 [B, D]
 
     Raises:
         srl_jax.errors.ConfigError: there is none, it is damaged, or does not fit this code.
@@ -53,7 +53,7 @@ def load_encoder(path: str | Path) -> tuple[Encoder, Params, checkpoint.Manifest
 def _agent_of(manifest: checkpoint.Manifest) -> tuple[Agent, Any]:
     """The agent of a checkpoint's configuration, and the shapes of its parameters."""
     try:
-        agent = make_agent(manifest.config, manifest.num_actions)
+        agent = make_agent(manifest.config, manifest.frame_shape, manifest.num_actions)
         return agent, agent.shapes().params
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{manifest.path}: {error}") from None
@@ -68,11 +68,13 @@ def greedy_policy(agent: Agent, params: Any, key: jax.Array) -> Policy:
     return policy
 
 
-def given_policy(config: Config, num_actions: int) -> Callable[[jax.Array], Policy] | None:
+def given_policy(
+    config: Config, frame_shape: tuple, num_actions: int
+) -> Callable[[jax.Array], Policy] | None:
     """The policy of `policy_from` without noise, a function of the key that it draws from; None without one.
 
     Raises:
-        srl_jax.errors.ConfigError: it cannot be loaded, or has another number of actions than the game.
+        srl_jax.errors.ConfigError: it cannot be loaded, or has other frames or actions than the game.
     """
     if not config.policy_from:
         return None
@@ -82,14 +84,16 @@ def given_policy(config: Config, num_actions: int) -> Callable[[jax.Array], Poli
             f"--policy_from={config.policy_from}: its policy has {manifest.num_actions} actions, "
             f"{config.game} has {num_actions}"
         )
+    checkpoint.check_frames(manifest, frame_shape, f"--policy_from={config.policy_from}", config.game)
     return lambda key: greedy_policy(agent, params, key)
 
 
-def initial_params(config: Config, template: dict[str, Params]) -> dict[str, Params]:
+def initial_params(config: Config, frame_shape: tuple, template: dict[str, Params]) -> dict[str, Params]:
     """{group: tree} of what starts from `encoder_from`: the encoder, and heads as `heads_from` says.
 
     Args:
         config: of the run.
+        frame_shape: (H, W, C) of its environments.
         template: parameters, or their shapes, of its agent.
 
     Raises:
@@ -97,7 +101,9 @@ def initial_params(config: Config, template: dict[str, Params]) -> dict[str, Par
     """
     if not config.encoder_from:
         return {}
-    found = checkpoint.load(checkpoint.read_manifest(config.encoder_from))
+    manifest = checkpoint.read_manifest(config.encoder_from)
+    checkpoint.check_frames(manifest, frame_shape, f"--encoder_from={config.encoder_from}", config.game)
+    found = checkpoint.load(manifest)
     wanted = {"representation": template.keys() - {RL}, "all": template.keys(), "none": {ENCODER}}
     names = sorted(wanted[config.heads_from] & found.keys())
     hint = "" if config.heads_from == "none" else " (--heads_from=none starts from the encoder alone)"

@@ -42,7 +42,7 @@ class Result(NamedTuple):
         env_steps, updates: done.
         interrupted: whether it was stopped before its end; its checkpoint is of that moment.
         pictures: {objective: (inputs, targets, outputs)}, see `srl_jax.diagnostics.pictures`.
-        recording: uint8 [T, H, W], the first games of the last evaluation; None without one.
+        recording: uint8 [T, H, W, C], the first games of the last evaluation; None without one.
     """
 
     env_steps: int
@@ -140,7 +140,8 @@ class Run:
         # Environments are made in their threads, so that the threads that they start yield, too.
         envs = list(self.env_threads.map(lambda c: make_env(c, "train", c.num_envs), configs))
         num_actions = int(envs[0].single_action_space.n)
-        self.agent = agent or make_agent(config, num_actions)
+        frame = envs[0].single_observation_space.shape
+        self.agent = agent or make_agent(config, frame, num_actions)
         self.device = over_seeds(self.agent, len(configs))
         self.seeds = [
             Seed(own, Path(out), self.agent, env, progress and i == 0)
@@ -148,7 +149,7 @@ class Run:
         ]
         self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
         self.act_keys = [named_key(seed.key, "act") for seed in self.seeds]
-        if policy := given_policy(config, num_actions):
+        if policy := given_policy(config, frame, num_actions):
             for seed in self.seeds:
                 seed.policy = policy(named_key(seed.key, "given policy"))
         self.env_steps = self.updates = 0
@@ -157,7 +158,7 @@ class Run:
         self.left = False  # nobody waits for the evaluation under way
         self.resumed = resume is not None
         if resume is None:
-            start = initial_params(config, self.agent.shapes().params)
+            start = initial_params(config, frame, self.agent.shapes().params)
             states = [self.agent.init(seed.key, start) for seed in self.seeds]
         else:
             states = list(self.env_threads.map(Seed.restore, self.seeds, resume))

@@ -43,7 +43,7 @@ class Replay:
     """Prioritized replay (Schaul et al. 2016, the proportional variant, stratified).
 
     Attributes, which together are all the state there is (N streams of L slots):
-        frames: uint8 [N, L, H, W].
+        frames: uint8 [N, L, H, W, C].
         actions, rewards, flags: int32, float32, uint8 [N, L], of the step after the frame. Flags:
             bit 0, the next observation is the episode's last; bit 1, the discount is 0.
         age: uint8 [N, L]; steps since the episode's first observation, at most stack - 1.
@@ -62,7 +62,7 @@ class Replay:
         *,
         capacity: int,
         num_streams: int,
-        frame_shape: tuple[int, int] = (84, 84),
+        frame_shape: tuple[int, int, int] = (84, 84, 1),
         stack: int = 4,
         horizon: int = 3,
         gamma: float = 0.99,
@@ -74,7 +74,7 @@ class Replay:
         Args:
             capacity: transitions in all; each stream gets capacity // num_streams slots.
             num_streams: environments, N.
-            frame_shape: (H, W) in pixels.
+            frame_shape: (H, W, C), in pixels and channels.
             stack: frames in an observation, S.
             horizon: steps in a window, K.
             gamma: the discount of one step.
@@ -134,7 +134,7 @@ class Replay:
         newest observation stored.
 
         Args:
-            frames: uint8 [M, H, W].
+            frames: uint8 [M, H, W, C].
             streams: int [M], no stream twice; None for all, in order.
 
         Raises:
@@ -173,7 +173,7 @@ class Replay:
             truncated: bool [N]; a time limit: the episode ends with discount gamma (unless another
                 flag says 0), so that a learner bootstraps from the final observation.
             life_lost: bool [N]; discount 0, but the episode and its frame stack go on.
-            frames: uint8 [N, H, W], after the actions; the episode's final frame where it ended.
+            frames: uint8 [N, H, W, C], after the actions; the episode's final frame where it ended.
 
         Raises:
             RuntimeError: a stream has not begun an episode since its last one ended.

@@ -93,7 +93,7 @@ class Seed:
         if config.diagnostics:
             say = self.report.progress.note
             self.diagnostics = Diagnostics(config, agent.measures, agent.horizon, out, say)
-        self.recording: np.ndarray | None = None  # uint8 [T, H, W], the first games of the last evaluation
+        self.recording: np.ndarray | None = None  # uint8 [T, H, W, C], the first games of the last evaluation
         self.best = -np.inf
         self.solved = self.evaluation_due = False
         self.saved: Manifest | None = None
@@ -205,8 +205,13 @@ class Seed:
 
     def save_parameters(self, params: Params, env_steps: int, updates: int, **options: Any) -> Manifest:
         """Writes a checkpoint, without options of parameters alone; see `srl_jax.checkpoint.save`."""
-        counts = {"num_actions": int(self.env.single_action_space.n), "env_steps": env_steps}
-        return checkpoint.save(self.out, params, self.config, updates=updates, **counts, **options)
+        counts = {
+            "num_actions": int(self.env.single_action_space.n),
+            "env_steps": env_steps,
+            "updates": updates,
+        }
+        frame = self.replay.frame_shape
+        return checkpoint.save(self.out, params, self.config, frame_shape=frame, **counts, **options)
 
     def restore(self, manifest: Manifest) -> TrainState:
         """Brings a new seed to where a checkpoint was written; the report must not be open yet.

@@ -1,8 +1,9 @@
 """The nouns of the project: what moves between replay, update and the losses.
 
-Shapes use B for batch, S for stacked frames (4), K for the window's horizon, H and W for the frame's
-height and width, D for the latent's size. Nothing here imports jax, so that a command line can be
-checked without paying for it.
+Shapes use B for batch, S for stacked frames (4), K for the window's horizon, H, W and C for a frame's height,
+width and channels (1 grey, 3 colour), D for the latent's size. An observation has S * C channels, frame by
+frame: channel s * C + c is c of frame s, and the newest frame is the last.
+Nothing here imports jax, so that a command line can be checked without paying for it.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Window(NamedTuple):
     after the last one the last one is repeated (those offsets have `valid` = 0).
 
     Attributes:
-        frames: uint8 [B, S + K, H, W]; frame i belongs to time t - S + 1 + i.
+        frames: uint8 [B, S + K, H, W, C]; frame i belongs to time t - S + 1 + i.
         actions: int32 [B, K]; `actions[:, k]` was taken in s_{t+k}. Zero where not valid.
         rewards: float32 [B, K]; `rewards[:, k]` followed `actions[:, k]`, as learnt from (clipped or
             not is the loop's choice). Zero where not valid.
@@ -57,10 +58,10 @@ class Encoder(NamedTuple):
 
     Attributes:
         init: key -> params.
-        apply: (params, uint8 [B, H, W, S]) -> float32 [B, D]; divides by 255 on entry. Images that are
+        apply: (params, uint8 [B, H, W, S * C]) -> float32 [B, D]; divides by 255 on entry. Images that are
             already float32 in [0, 1] pass as they are.
         features: D.
-        observation_shape: (H, W, S).
+        observation_shape: (H, W, S * C).
         make_decoder: (extra_inputs: int = 0) -> Decoder; its input is the latent joined with that many
             more numbers (a one-hot action, say). None where there is no decoder.
         map_shape: (H', W', C'), the last convolution's map of one observation before it is flattened; None
@@ -76,7 +77,7 @@ class Encoder(NamedTuple):
 
 
 class Decoder(NamedTuple):
-    """A decoder, as pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S]."""
+    """A decoder, pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S * C]."""
 
     init: Callable[[jax.Array], Params]
     apply: Callable[[Params, Array], jax.Array]
@@ -149,7 +150,7 @@ class Objective(NamedTuple):
         slow: how its head's slow copy follows, (new, old, step) -> slow; None if it has none. A rule that
             changes nothing but in every k-th step may say so by an attribute `every` = k.
         is_decoder: the head is a decoder, which the optimizer's decoder weight decay applies to.
-        image: None, or (head, latents, window) -> (target, output), float32 [B, H, W, S] each, for the
+        image: None, or (head, latents, window) -> (target, output), float32 [B, H, W, S * C] each, for the
             picture that shows what it learnt.
     """
 

@@ -431,9 +431,9 @@ def make_act(encoder: Encoder, q_values: Callable, *, noisy: bool) -> Callable:
         noisy: whether noisy layers act with noise (training) or with their means (evaluation).
 
     Returns:
-        The function. It takes the encoder's and the RL head's parameters, frames uint8 [N, S, H, W], a key,
-        a step (its draws come from fold_in(key, step)) and epsilon, a float32 scalar in [0, 1], and gives
-        int32 [N]: the greedy action, or with probability epsilon a uniformly random one.
+        The function. It takes the encoder's and the RL head's parameters, frames uint8 [N, S, H, W, C], a
+        key, a step (its draws come from fold_in(key, step)) and epsilon, a float32 scalar in [0, 1], and
+        gives int32 [N]: the greedy action, or with probability epsilon a uniformly random one.
     """
 
     def act(params: Params, head: Params, frames: Array, key: Array, step: Array, epsilon: Array) -> Array:

@@ -7,10 +7,10 @@ from srl_jax.types import Array, Window
 
 
 def observation(window: Window, k: int | Array) -> Array:
-    """The stack of frames s_{t+k}, newest last: uint8 [B, H, W, S].
+    """The stack of frames s_{t+k}, newest last: uint8 [B, H, W, S * C].
 
     Args:
-        window: its frames are [B, S + K, H, W].
+        window: its frames are [B, S + K, H, W, C].
         k: an offset in 0..K, an int for all rows or int32 [B], one for each.
     """
     size = window.frames.shape[1] - window.actions.shape[1]
@@ -23,7 +23,7 @@ def observation(window: Window, k: int | Array) -> Array:
 
 
 def image(window: Window, k: int) -> Array:
-    """The observation at offset k as a regression target: float32 [B, H, W, S] in [0, 1]."""
+    """The observation at offset k as a regression target: float32 [B, H, W, S * C] in [0, 1]."""
     return to_unit(observation(window, k))
 
 
@@ -33,5 +33,7 @@ def to_unit(pixels: Array) -> Array:
 
 
 def stack_last(frames: Array) -> Array:
-    """[B, S, H, W], as replay and the actor keep it, -> [B, H, W, S], as networks read it."""
-    return jnp.moveaxis(frames, 1, -1)
+    """[B, S, H, W, C], as replay and the actor keep it, -> [B, H, W, S * C], as networks read it."""
+    batch, stack, height, width, channels = frames.shape
+    planes = jnp.moveaxis(frames, -1, 2).reshape(batch, stack * channels, height, width)
+    return jnp.moveaxis(planes, 1, -1)

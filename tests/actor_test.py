@@ -19,8 +19,8 @@ EVENTS = st.tuples(st.sampled_from([STEP, STEP, BEGIN]), st.lists(st.booleans(),
 def test_frame_stack_is_the_end_of_the_episode_so_far(stack, events):
     # Every frame has a number of its own; the reference keeps whole episodes.
     numbers = itertools.count(1)
-    new = lambda: np.array([[[next(numbers)]], [[next(numbers)]]], np.uint8)  # noqa: E731
-    stacks = FrameStack(2, stack, (1, 1))
+    new = lambda: np.array([[[[next(numbers)]]], [[[next(numbers)]]]], np.uint8)  # noqa: E731
+    stacks = FrameStack(2, stack, (1, 1, 1))
     frames = new()
     stacks.begin(frames)
     episodes = [[int(frame)] for frame in frames.ravel()]
@@ -33,21 +33,21 @@ def test_frame_stack_is_the_end_of_the_episode_so_far(stack, events):
             stacks.begin(frames, np.array(mask))
         for i, begins in enumerate(mask):
             if begins:
-                episodes[i] = [int(frames[i, 0, 0])]
+                episodes[i] = [int(frames[i, 0, 0, 0])]
             elif what == STEP:
-                episodes[i].append(int(frames[i, 0, 0]))
+                episodes[i].append(int(frames[i, 0, 0, 0]))
         expected = [([e[0]] * stack + e[1:])[-stack:] for e in episodes]
-        assert stacks.observations()[:, :, 0, 0].tolist() == expected
+        assert stacks.observations()[:, :, 0, 0, 0].tolist() == expected
 
 
 def test_observations_are_the_callers_own():
-    stacks = FrameStack(1, 2, (1, 1))
-    stacks.begin(np.full((1, 1, 1), 7, np.uint8))
+    stacks = FrameStack(1, 2, (1, 1, 3))
+    stacks.begin(np.full((1, 1, 1, 3), 7, np.uint8))
     before = stacks.observations()
-    stacks.push(np.full((1, 1, 1), 8, np.uint8))
-    assert before.shape == (1, 2, 1, 1) and before.dtype == np.uint8
-    assert before.ravel().tolist() == [7, 7]
-    assert stacks.observations().ravel().tolist() == [7, 8]
+    stacks.push(np.full((1, 1, 1, 3), 8, np.uint8))
+    assert before.shape == (1, 2, 1, 1, 3) and before.dtype == np.uint8
+    assert before[0, :, 0, 0].tolist() == [[7] * 3, [7] * 3]
+    assert stacks.observations()[0, :, 0, 0].tolist() == [[7] * 3, [8] * 3]
 
 
 def test_seeds_are_31_bits_and_differ_by_run_name_number_and_order():
@@ -67,7 +67,7 @@ def test_linear_schedule_by_hand():
 
 
 def test_random_policy_is_uniform_and_repeats_with_its_seed():
-    frames = np.zeros((1000, 1, 1, 1), np.uint8)
+    frames = np.zeros((1000, 1, 1, 1, 1), np.uint8)
     drawn = lambda seed: random_policy(4, np.random.default_rng(seed))  # noqa: E731
     actions = drawn(7)(frames, 0, 0.0)
     assert actions.dtype == np.int32

@@ -11,8 +11,8 @@ from tests.helpers import jit
 
 def shifts(frames, pad):
     """{(dy, dx): the frames padded by repetition and cropped there}: all that may come out."""
-    padded = np.pad(frames, [(0, 0), (pad, pad), (pad, pad)], mode="edge")
-    height, width = frames.shape[1:]
+    padded = np.pad(frames, [(0, 0), (pad, pad), (pad, pad), (0, 0)], mode="edge")
+    height, width = frames.shape[1:3]
     return {
         (y - pad, x - pad): padded[:, y : y + height, x : x + width]
         for y in range(2 * pad + 1)
@@ -28,16 +28,16 @@ def draw(frames, pad, number, seed=0):
 def test_a_shift_by_hand():
     # Down by one in the crop (so the picture moves up and its last row repeats), and left by one (so it
     # moves right and its first column repeats).
-    frames = np.array([[[1, 2, 3], [4, 5, 6], [7, 8, 9]]], np.uint8)
+    frames = np.array([[[1, 2, 3], [4, 5, 6], [7, 8, 9]]], np.uint8)[..., None]
     expected = [[4, 4, 5], [7, 7, 8], [7, 7, 8]]
-    np.testing.assert_array_equal(shifts(frames, 1)[1, -1][0], expected)
-    assert any(np.array_equal(shifted[0], expected) for shifted in draw(frames, 1, 100))
+    np.testing.assert_array_equal(shifts(frames, 1)[1, -1][0, :, :, 0], expected)
+    assert any(np.array_equal(shifted[0, :, :, 0], expected) for shifted in draw(frames, 1, 100))
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
 def test_every_draw_is_one_shift_of_the_whole_sequence_and_all_shifts_come_up(dtype):
-    # 25 shifts of 3 frames of 6 x 7 pixels; all pixels differ, so a result names its shift.
-    frames = np.random.default_rng(0).permutation(3 * 6 * 7).reshape(3, 6, 7).astype(dtype)
+    # 25 shifts of 3 frames of 6 x 7 pixels of 2 channels; all numbers differ, so a result names its shift.
+    frames = np.random.default_rng(0).permutation(3 * 6 * 7 * 2).reshape(3, 6, 7, 2).astype(dtype)
     names = {shifted.tobytes(): offset for offset, shifted in shifts(frames, 2).items()}
     assert len(names) == 25
     results = draw(frames, 2, 1000)
@@ -49,7 +49,7 @@ def test_every_draw_is_one_shift_of_the_whole_sequence_and_all_shifts_come_up(dt
 
 
 def test_four_pixels_is_the_default_and_none_the_identity():
-    frames = np.random.default_rng(0).integers(0, 256, (1, 20, 20), dtype=np.uint8)
+    frames = np.random.default_rng(0).integers(0, 256, (1, 20, 20, 1), dtype=np.uint8)
     keys = jax.random.split(jax.random.key(0), 200)
     allowed = {shifted.tobytes() for shifted in shifts(frames, 4).values()}
     results = np.asarray(jit(jax.vmap(lambda key: random_shift(jnp.asarray(frames), key)))(keys))

@@ -38,7 +38,7 @@ def make_params(seed=0):
 
 
 def write(run, params=None, config=CONFIG, env_steps=1000, **options):
-    counts = {"num_actions": 3, "env_steps": env_steps, "updates": 100}
+    counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": env_steps, "updates": 100}
     return checkpoint.save(run, make_params() if params is None else params, config, **counts, **options)
 
 
@@ -111,7 +111,8 @@ def test_round_trip_is_bit_identical(tmp_path, where):
     manifest = checkpoint.read_manifest(path)
     assert manifest.path == final
     assert manifest.config == CONFIG
-    assert (manifest.num_actions, manifest.env_steps, manifest.updates) == (3, 1000, 100)
+    assert (manifest.frame_shape, manifest.num_actions) == ((42, 42, 1), 3)
+    assert (manifest.env_steps, manifest.updates) == (1000, 100)
     loaded = checkpoint.load_into(params, checkpoint.load(manifest), "test")
     assert same_bits(loaded["encoder"]["odd"]["bias"], params["encoder"]["odd"]["bias"])
     del loaded["encoder"]["odd"], params["encoder"]["odd"]  # NaN is not equal to itself
@@ -541,7 +542,12 @@ def file(name):
     [
         lambda m: [],
         lambda m: {**m, "format": 1},
-        lambda m: {**m, "format": 4},
+        lambda m: {**m, "format": 5},
+        lambda m: {**m, "frame_shape": [42, 42]},
+        lambda m: {**m, "frame_shape": [42, 0, 1]},
+        lambda m: {**m, "frame_shape": [42, 42, True]},
+        lambda m: {**m, "frame_shape": 42},
+        lambda m: {**m, "frame_shape": [2**31, 42, 1]},
         lambda m: {**m, "num_actions": "3"},
         lambda m: {**m, "env_steps": -1},
         lambda m: {**m, "updates": True},
@@ -575,6 +581,12 @@ def test_a_manifest_of_another_form_is_refused(copy, change):
     with pytest.raises(ConfigError) as error:
         checkpoint.read_manifest(copy)
     assert str(copy) in str(error.value) and "\n" not in str(error.value)
+
+
+def test_a_checkpoint_from_before_frames_had_channels_is_refused_by_its_format(copy):
+    resign(copy, lambda m: {n: m[n] for n in m if n != "frame_shape"} | {"format": 3})
+    with pytest.raises(ConfigError, match="checkpoint of format 3, not 4$"):
+        checkpoint.read_manifest(copy)
 
 
 @pytest.mark.parametrize("data", [b"", b"{", b"[" * 100_000, b"\xff", b"nan", b"9" * 5000, b" " * (1 << 25)])

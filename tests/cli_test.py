@@ -325,7 +325,7 @@ def _checkpoint(out, env_steps, ended=False):
     """A checkpoint of the run in a directory, as the loop writes it."""
     params = {"encoder": {"kernel": np.ones(2, np.float32)}}
     state = None if ended else checkpoint.State({}, {}, {})
-    counts = {"num_actions": 3, "env_steps": env_steps, "updates": 1}
+    counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": env_steps, "updates": 1}
     return checkpoint.save(out, params, Config.load(out), state=state, **counts)
 
 

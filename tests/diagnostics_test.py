@@ -115,9 +115,9 @@ def test_which_epochs_are_kept():
 
 
 def test_errors_on_moving_and_static_pixels():
-    before = np.zeros((2, 2, 2), np.float32)
-    target = np.array([[[1, 0.05], [0, 0]], [[0, 0], [0, 0.5]]], np.float32)
-    output = np.array([[[0.5, 0], [0, 0]], [[0.2, 0], [0, 0.5]]], np.float32)
+    before = np.zeros((2, 2, 2, 1), np.float32)
+    target = np.array([[[1, 0.05], [0, 0]], [[0, 0], [0, 0.5]]], np.float32)[..., None]
+    output = np.array([[[0.5, 0], [0, 0]], [[0.2, 0], [0, 0.5]]], np.float32)[..., None]
     found = measures.moving_errors(before, target, output)
     # Two of eight pixels move. Their errors are 0.25 and 0, the mean image's (1 - 0.5)^2 and (0.5 - 0.25)^2.
     assert found["moving"] == pytest.approx(0.125)
@@ -127,6 +127,15 @@ def test_errors_on_moving_and_static_pixels():
     assert measures.moving_share(frames.astype(np.uint8)) == 2 / 8
     still = measures.moving_errors(target, target, output)
     assert np.isnan(still["moving"]) and np.isnan(still["moving_explained"])
+
+
+def test_a_pixel_moves_with_any_of_its_colours():
+    # One pixel of two turns from red to green; errors are averaged over the three channels.
+    before, target = np.zeros((2, 1, 1, 2, 3), np.float32)
+    before[..., 0, 0] = target[..., 0, 1] = 1.0
+    found = measures.moving_errors(before, target, np.zeros_like(target))
+    assert found["moving"] == pytest.approx(1 / 3) and found["static"] == 0.0
+    assert measures.moving_share((255 * np.stack([before, target], 1)).astype(np.uint8)) == 0.5
 
 
 def test_a_probe_finds_what_is_linear_in_the_latent_and_nothing_else():
@@ -204,7 +213,9 @@ def test_an_image_of_two_latents_is_left_out_and_told():
         return latents.online(1), decoder.apply(head, latents.online(0))
 
     terms = {"one": objective(1.0)._replace(image=later, horizon=1)}
-    functions = make_functions(encoder, terms, MODES["pretrain"], augment="none", target_encoder="slow")
+    functions = make_functions(
+        encoder, terms, MODES["pretrain"], channels=1, augment="none", target_encoder="slow"
+    )
     assert functions.decode == {} and functions.others == ("one",) and functions.conflict is None
 
 
@@ -215,7 +226,7 @@ def test_held_out_observations_are_the_games_and_know_its_state():
     config = Config(**{**SMALL, "seed": 5, "num_envs": 2})
     held_out = heldout.collect(config, 3)
     frames = held_out.windows.frames
-    assert frames.shape == (heldout.WINDOWS, 7, 42, 42) and not held_out.problem
+    assert frames.shape == (heldout.WINDOWS, 7, 42, 42, 1) and not held_out.problem
     assert held_out.variables == ("ball_x", "ball_y", "ball_velocity_x", "ball_velocity_y", "paddle_x")
     # The same ones for another seed, another arm and another horizon.
     other = heldout.collect(Config(**{**SMALL, "seed": 6, "gamma": 0.5}), 1)
@@ -234,7 +245,7 @@ def test_held_out_observations_are_the_games_and_know_its_state():
 def test_held_out_windows_may_reach_far(horizon):
     config = Config(**SMALL)
     near, far = heldout.collect(config, 3), heldout.collect(config, horizon)
-    assert far.windows.frames.shape == (heldout.WINDOWS, 4 + horizon, 42, 42)
+    assert far.windows.frames.shape == (heldout.WINDOWS, 4 + horizon, 42, 42, 1)
     assert far.windows.valid.shape == (heldout.WINDOWS, horizon)
     # The same observations, and windows that go on where shorter ones end.
     np.testing.assert_array_equal(far.states, near.states)
@@ -259,18 +270,19 @@ def test_held_out_observations_are_those_of_runs_before(game, horizon, sha256):
         pytest.importorskip("ale_py")
     held_out = heldout.collect(Config(game=game), horizon)
     digest = hashlib.sha256()
-    for array in (*held_out.windows, held_out.states, held_out.episodes):
+    windows = held_out.windows._replace(frames=held_out.windows.frames[..., 0])  # frames had no channels
+    for array in (*windows, held_out.states, held_out.episodes):
         digest.update(f"{array.dtype} {array.shape}".encode())
         digest.update(array.tobytes())
     assert digest.hexdigest()[:16] == sha256
 
 
 def test_a_generator_of_ones_own_leaves_replays_alone():
-    replay = Replay(capacity=100, num_streams=1, frame_shape=(2, 2), horizon=1, seed=3)
-    replay.begin(np.zeros((1, 2, 2), np.uint8))
+    replay = Replay(capacity=100, num_streams=1, frame_shape=(2, 2, 1), horizon=1, seed=3)
+    replay.begin(np.zeros((1, 2, 2, 1), np.uint8))
     no = np.zeros(1, bool)
     for i in range(30):
-        replay.add(np.array([i]), np.zeros(1), no, no, no, np.full((1, 2, 2), i, np.uint8))
+        replay.add(np.array([i]), np.zeros(1), no, no, no, np.full((1, 2, 2, 1), i, np.uint8))
     before = json.dumps(replay.rng.bit_generator.state)
     first, second = (replay.sample(8, 0.4, np.random.default_rng(1))[1] for _ in range(2))
     assert np.array_equal(first, second) and json.dumps(replay.rng.bit_generator.state) == before
@@ -296,7 +308,14 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     assert first.steps == (0, 60, 120, 180)
     for step in (0, 60):
         values = first.measure(state, step, None, 1.0, None)
-        arguments = {"num_actions": 3, "env_steps": step, "updates": 0, "keep": 0, "folder": "encoders"}
+        arguments = {
+            "frame_shape": (42, 42, 1),
+            "num_actions": 3,
+            "env_steps": step,
+            "updates": 0,
+            "keep": 0,
+            "folder": "encoders",
+        }
         checkpoint.save(tmp_path, first.parts(params), config, **arguments)
     assert values["diag/drift/steps"] == [0] and values["diag/drift/cka"] == [pytest.approx(1)]
     assert json.loads(json.dumps(values, allow_nan=False)) == values
@@ -349,16 +368,16 @@ def test_the_emulator_whose_memory_is_read_is_in_step(sticky_actions):
         frames, info = env.reset()
         twin.reset(int(env.ale_seeds[0]) if env.steps_since_seeded[0] == 0 else None)
         for _ in range(70):
-            twin.check(frames[0], int(info["frame_number"][0]), int(info["lives"][0]))
+            twin.check(frames[0, :, :, 0], int(info["frame_number"][0]), int(info["lives"][0]))
             action = rng.integers(env.single_action_space.n, size=1)
             frames, *_, info = env.step(action)
             twin.step(int(action[0]), look=True)
-    wrong = frames[0].copy()
+    wrong = frames[0, :, :, 0].copy()
     wrong[40, 40] += 5
     with pytest.raises(OutOfStep, match="a pixel differs by"):
         twin.check(wrong, int(info["frame_number"][0]), int(info["lives"][0]))
     with pytest.raises(OutOfStep, match="frame number"):
-        twin.check(frames[0], int(info["frame_number"][0]) - 4, int(info["lives"][0]))
+        twin.check(frames[0, :, :, 0], int(info["frame_number"][0]) - 4, int(info["lives"][0]))
     env.close()
 
 
@@ -369,7 +388,7 @@ def test_labelled_bytes_hold_what_is_seen(monkeypatch):
     assert held_out.variables == ("player_y", "player_x", "enemy_y", "enemy_x", "ball_x", "ball_y")
     assert not held_out.problem
     # Our paddle, bright in column 75 or so of 84, is as far down as its byte says.
-    column = held_out.observations[:, -1, 14:78, 72:78].max(2)
+    column = held_out.observations[:, -1, 14:78, 72:78, 0].max(2)
     seen = column > 140
     there = seen.sum(1) >= 4
     middle = (seen * np.arange(64)).sum(1)[there] / seen.sum(1)[there]
@@ -383,7 +402,7 @@ def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
     lines = []
 
     def decode(head, z, window):  # the errors are the decoder's number, whatever the latent
-        image = np.zeros((len(z), 2, 2, 2), np.float32)
+        image = np.zeros((len(z), 2, 2, 2, 1), np.float32)
         return np.full(len(z), head["w"]), image, image
 
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
@@ -393,7 +412,14 @@ def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
     def measure(step):
         params = {"encoder": {"w": np.float32(0.5)}, "x": {"w": np.float32(step)}}
         values = diagnostics.measure(TrainState(params, {}, None, np.int32(0), None), step, None, 1.0, None)
-        arguments = {"num_actions": 3, "env_steps": step, "updates": 0, "keep": 0, "folder": "encoders"}
+        arguments = {
+            "frame_shape": (42, 42, 1),
+            "num_actions": 3,
+            "env_steps": step,
+            "updates": 0,
+            "keep": 0,
+            "folder": "encoders",
+        }
         checkpoint.save(tmp_path, diagnostics.parts(params), config, **arguments)
         return [values[f"diag/{which}/x"] for which in ("decoder_now", "encoder_now")]
 

@@ -30,7 +30,7 @@ def make(path, config=CONFIG, checkpoints=(), ended=False, reached=None):
     made = []
     for env_steps in checkpoints:
         state = None if ended else GOING_ON
-        counts = {"num_actions": 3, "env_steps": env_steps, "updates": 1}
+        counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": env_steps, "updates": 1}
         made.append(checkpoint.save(path, PARAMS, config, state=state, **counts))
     rows = [{"kind": "train", "env_steps": n} for n in ([] if reached is None else [0, reached])]
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -236,7 +236,7 @@ def test_seeds_without_a_step_in_common_are_refused(tmp_path):
 
 def test_seeds_of_which_one_was_killed_at_its_end_go_on_from_before(tmp_path):
     runs = seeds(tmp_path, (400,), (400,))
-    counts = {"num_actions": 3, "env_steps": 500, "updates": 1}
+    counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": 500, "updates": 1}
     checkpoint.save(runs[0][0], PARAMS, runs[0][1], **counts)
     assert [manifest.env_steps for manifest in all_to_resume(runs)] == [400, 400]
     checkpoint.save(runs[1][0], PARAMS, runs[1][1], **counts)
@@ -283,7 +283,7 @@ def test_a_run_that_ended_before_its_first_row_is_begun_anew(tmp_path, capsys, k
     if kind == "config":
         (run / "metrics.jsonl").unlink()
     elif kind == "encoder":
-        counts = {"num_actions": 3, "env_steps": 0, "updates": 0}
+        counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": 0, "updates": 0}
         checkpoint.save(run, PARAMS, other, folder="encoders", keep=0, **counts)
         (run / "tensorboard").mkdir()
     elif kind == "half a checkpoint":
@@ -300,7 +300,7 @@ def test_a_run_that_ended_before_its_first_row_is_begun_anew(tmp_path, capsys, k
 def test_what_a_run_has_written_is_kept(tmp_path, kind):
     path = tmp_path / "run"
     make(path, reached=0 if kind == "a row" else None)
-    counts = {"num_actions": 3, "updates": 0, "keep": 0}
+    counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "updates": 0, "keep": 0}
     if kind == "a checkpoint":
         checkpoint.save(path, PARAMS, CONFIG, env_steps=4, **counts)
     elif "encoder" in kind:

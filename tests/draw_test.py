@@ -70,7 +70,7 @@ def test_a_recording_becomes_a_gif_of_the_same_size(tmp_path, size, scale):
     from PIL import Image
 
     _write(tmp_path)
-    frames = np.zeros((3, size, size), np.uint8)
+    frames = np.zeros((3, size, size, 1), np.uint8)
     frames[1, 5] = 255
     (path,) = draw.draw_run(tmp_path, Config(), recording=frames)
     with Image.open(path) as image:

@@ -1,13 +1,16 @@
 """srl_jax/encoders: sizes against the thesis, mirrors, and what goes in."""
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from srl_jax import encoders
+from srl_jax.encoders.convolutional import Layer, layer_sides
+from srl_jax.encoders.impala import doubled, halved
 from srl_jax.window import to_unit
-from tests.helpers import STACK, count, jit, random_params
+from tests.helpers import STACK, count, identical, jit, random_params
 
 
 @pytest.mark.parametrize(
@@ -35,12 +38,10 @@ def test_parameter_counts_and_features_at_84_pixels(name, options, features, num
 
 @pytest.mark.parametrize("extra", [0, 6])
 @pytest.mark.parametrize(
-    ("name", "size"),
-    # nature at 42 would see 36 pixels and is refused; Catch's 42 is for the others.
-    [(name, 84) for name in encoders.REGISTRY] + [("nature", 36), ("sac_ae", 42), ("tiny", 42)],
+    "shape", [(84, 84, 4), (40, 40, 4), (42, 42, 4), (56, 56, 4), (64, 64, 12), (96, 96, 9), (41, 73, 6)]
 )
-def test_decoders_mirror_their_encoder(name, size, extra):
-    shape = (size, size, 4)
+@pytest.mark.parametrize("name", encoders.REGISTRY)
+def test_decoders_mirror_their_encoder(name, shape, extra):
     encoder = encoders.REGISTRY[name](shape)
     decoder = encoder.make_decoder(extra)
     params = jax.eval_shape(decoder.init, jax.random.key(0))
@@ -118,22 +119,134 @@ def test_bottleneck_is_normalised_before_its_tanh(layer_norm):
     assert normal == layer_norm
 
 
-@pytest.mark.parametrize("name", encoders.REGISTRY)
-def test_frames_that_cannot_be_encoded_are_refused(name):
-    with pytest.raises(ValueError, match="square"):
-        encoders.REGISTRY[name]((84, 80, 4))
-    with pytest.raises(ValueError, match="too small"):
-        encoders.REGISTRY[name]((8, 8, 4))
+@pytest.mark.parametrize(("name", "least"), [("nature", 29), ("sac_ae", 14), ("tiny", 15)])
+def test_frames_below_the_least_size_of_the_layers_are_refused(name, least):
+    # nature needs 3 pixels for its last layer, so 5 for the one before and, with zeros below, 8 + 4 * 5 + 1.
+    encoders.REGISTRY[name]((84, least, 4))
+    for shape in ((84, least - 1, 4), (least - 1, 84, 4)):
+        with pytest.raises(ValueError, match=f"frames of {least - 1} pixels are too small: a kernel of"):
+            encoders.REGISTRY[name](shape)
 
 
-def test_frames_that_would_be_cut_are_refused_with_the_size_that_fits():
-    # nature at 42: 42 -> 9 -> 3 -> 1. The last one sees 3, they see (3 - 1) * 2 + 4 = 8 of the 9, and these
-    # (8 - 1) * 4 + 8 = 36 of the 42.
-    with pytest.raises(ValueError, match="36 fits"):
-        encoders.nature((42, 42, 4))
-    encoders.nature((36, 36, 4))
-    # sac_ae at 84 sees 40 * 2 + 3 = 83 of 84: within a twentieth, and the thesis' own network.
-    encoders.sac_ae((84, 84, 4))
+def test_sides_of_layers_by_hand():
+    layers = [Layer(32, 8, 4), Layer(64, 4, 2), Layer(64, 3, 1)]
+    assert layer_sides(84, layers) == [84, 20, 9, 7]  # all fit
+    # 96 - 8 is 22 strides. 23 - 4 is 9 and a half, so the last pixel is left out: 4 of the image's, 1 in 24.
+    assert layer_sides(96, layers) == [96, 23, 10, 8]
+    # 64 -> 15 -> 6 -> 4 would see (13 * 4) + 8 = 60 of 64, less than 19 of 20: a row of zeros for 15 - 4.
+    assert layer_sides(64, layers) == [64, 15, 7, 5]
+    # The thesis' network sees 40 * 2 + 3 = 83 of 84, Catch's at 84 19 * 4 + 6 = 82.
+    assert layer_sides(84, [Layer(32, 3, 2), Layer(32, 3, 1)]) == [84, 41, 39]
+    assert layer_sides(84, [Layer(16, 6, 4), Layer(16, 4, 2)]) == [84, 20, 9]
+
+
+@pytest.mark.parametrize("name", encoders.REGISTRY.keys() - {"sac_ae"})  # which leaves out one row in 64
+def test_every_pixel_of_an_odd_image_counts(name):
+    shape = (64, 41, 3)
+    encoder = encoders.REGISTRY[name](shape)
+    params = random_params(encoder.init)
+    images = np.random.default_rng(0).uniform(size=(2, *shape)).astype(np.float32)
+    gradient = np.asarray(jit(jax.grad(lambda x: jnp.sum(encoder.apply(params, x) ** 2)))(images))
+    assert (gradient != 0).any((0, 3)).all()
+
+
+def test_impala_at_84_pixels():
+    # 3*3*4*16 + 16 = 592;  4 * (3*3*16*16 + 16) = 9,280;  3*3*16*32 + 32 = 4,640;  4 * (3*3*32*32 + 32) =
+    # 36,992;  9,248;  36,992.  84 -> 42 -> 21 -> 11: 11*11*32 = 3,872 numbers, 3,872 * 256 + 256 = 991,488.
+    encoder = encoders.impala((84, 84, 4))
+    params = jax.eval_shape(encoder.init, jax.random.key(0))
+    assert count(params) == 592 + 9_280 + 4_640 + 2 * 36_992 + 9_248 + 991_488
+    wider = encoders.impala((84, 84, 4), features=10, width=2)
+    kernel = jax.eval_shape(wider.init, jax.random.key(0))["Conv_0"]["kernel"]
+    assert wider.features == 10 and kernel.shape == (3, 3, 4, 32)
+    for option in ("features", "width"):
+        with pytest.raises(ValueError, match=option):
+            encoders.impala((84, 84, 4), **{option: 0})
+
+
+@pytest.mark.parametrize(("height", "width"), [(4, 5), (7, 6), (1, 2)])
+def test_halving_is_max_pooling(height, width):
+    x = np.random.default_rng(0).permutation(2 * height * width * 3).reshape(2, height, width, 3)
+    x = x.astype(np.float32)
+
+    def both(pool):
+        y, pull = jax.vjp(pool, x)
+        return y, pull(jnp.arange(y.size, dtype=jnp.float32).reshape(y.shape))[0]
+
+    ours = both(halved)
+    theirs = both(lambda x: nn.max_pool(x, (3, 3), (2, 2), "SAME"))
+    assert identical(ours, theirs)
+
+
+def test_doubling_by_hand():
+    x = np.array([[1.0, 2.0], [3.0, 4.0]])[None, :, :, None]
+    y = np.asarray(doubled(x, (3, 4)))[0, :, :, 0]
+    assert y.tolist() == [[1, 1, 2, 2], [1, 1, 2, 2], [3, 3, 4, 4]]
+
+
+def test_where_a_map_is_flattened_its_shape_is_known():
+    shapes = {"nature": (7, 7, 64), "sac_ae": (35, 35, 32), "tiny": (9, 9, 16), "impala": (11, 11, 32)}
+    assert {n: row((84, 84, 4)).map_shape for n, row in encoders.REGISTRY.items()} == shapes
+    assert encoders.nature((64, 96, 4)).map_shape == (5, 8, 64)
+
+
+# Any flax module
+
+
+class Flat(nn.Module):
+    """A linear layer of the pixels."""
+
+    features: int = 5
+
+    @nn.compact
+    def __call__(self, x):
+        return nn.Dense(self.features)(to_unit(x).reshape(len(x), -1))
+
+
+class Unflat(nn.Module):
+    """A linear layer, shaped as an image."""
+
+    shape: tuple
+
+    @nn.compact
+    def __call__(self, z):
+        return nn.Dense(int(np.prod(self.shape)))(z).reshape(-1, *self.shape)
+
+
+class Normalised(nn.Module):
+    """With statistics that are no parameters."""
+
+    @nn.compact
+    def __call__(self, x):
+        return nn.BatchNorm(use_running_average=False)(Flat()(x))
+
+
+def test_any_flax_module_is_an_encoder():
+    shape = (6, 4, 3)
+    encoder = encoders.flax_encoder(Flat(), Unflat(shape), shape)
+    assert (encoder.features, encoder.observation_shape, encoder.map_shape) == (5, shape, None)
+    images = np.random.default_rng(0).integers(0, 256, (2, *shape), dtype=np.uint8)
+    params = random_params(encoder.init)
+    kernel, bias = (np.asarray(params["Dense_0"][name]) for name in ("kernel", "bias"))
+    z = encoder.apply(params, images)
+    np.testing.assert_allclose(z, images.reshape(2, -1) / 255 @ kernel + bias, rtol=1e-5, atol=1e-5)
+    decoder = encoder.make_decoder(2)
+    head = random_params(decoder.init)
+    assert head["Dense_0"]["kernel"].shape == (5 + 2, 6 * 4 * 3)
+    assert decoder.apply(head, np.zeros((2, 7), np.float32)).shape == (2, *shape)
+
+
+def test_a_module_that_is_no_encoder_or_decoder_is_refused_by_name():
+    shape = (6, 4, 3)
+    with pytest.raises(ValueError, match=r"Conv must give latents \[B, D\], not \[B, 6, 4, 7\]"):
+        encoders.flax_encoder(nn.Conv(7, (3, 3)), None, shape)
+    with pytest.raises(ValueError, match="Normalised has variables that are no parameters: batch_stats"):
+        encoders.flax_encoder(Normalised(), None, shape)
+    with pytest.raises(ValueError, match="the encoder Flat has no decoder"):
+        encoders.flax_encoder(Flat(), None, shape).make_decoder()
+    encoder = encoders.flax_encoder(Flat(), Unflat((4, 6, 3)), shape)
+    with pytest.raises(ValueError, match=r"Unflat must give images \[B, 6, 4, 3\], not \[B, 4, 6, 3\]"):
+        encoder.make_decoder()
 
 
 def test_a_bottleneck_needs_features():

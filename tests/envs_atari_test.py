@@ -15,7 +15,7 @@ def test_interface():
     assert isinstance(env, VectorEnv)
     # ale_py changes the metadata of gymnasium's base class.
     assert env.metadata["autoreset_mode"] is AutoresetMode.DISABLED
-    assert env.single_observation_space.shape == (42, 42)
+    assert env.single_observation_space.shape == (42, 42, 1)
     frames, info = env.reset()
     assert env.observation_space.contains(frames) and not info["life_lost"].any()
     for dtype in (np.int32, np.int64):

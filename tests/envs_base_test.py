@@ -16,7 +16,7 @@ def test_interface(game):
     env = envs.make(game, num_envs=3, seed=0)
     assert isinstance(env, VectorEnv)
     assert env.metadata["autoreset_mode"] is AutoresetMode.DISABLED
-    assert env.single_observation_space.shape == (84, 84)
+    assert env.single_observation_space.shape == (84, 84, 1)
     assert env.single_action_space.n == 3 == len(env.action_meanings)
     frames, info = env.reset()
     assert env.observation_space.contains(frames)

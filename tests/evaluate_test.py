@@ -14,7 +14,7 @@ class Scripted:
     Every frame names its environment, game and step, as the pixel 100 * i + 10 * game + step (below 256).
     """
 
-    single_observation_space = Box(0, 255, (1, 1), np.uint8)
+    single_observation_space = Box(0, 255, (1, 1, 1), np.uint8)
 
     def __init__(self, scripts, truncate=False):
         self.scripts, self.num_envs, self.truncate = scripts, len(scripts), truncate
@@ -24,7 +24,7 @@ class Scripted:
 
     def frames(self):
         pixels = 100 * np.arange(self.num_envs) + 10 * self.game + self.time
-        return pixels.astype(np.uint8)[:, None, None]
+        return pixels.astype(np.uint8)[:, None, None, None]
 
     def script(self, i):
         return self.scripts[i][self.game[i] % len(self.scripts[i])]
@@ -57,7 +57,7 @@ def watching(seen):
     """A policy that notes what it is shown and always does 1."""
 
     def policy(frames, step, epsilon):
-        seen.append((frames[..., 0, 0].tolist(), step, epsilon))
+        seen.append((frames[..., 0, 0, 0].tolist(), step, epsilon))
         return np.ones(len(frames), np.int32)
 
     return policy
@@ -76,7 +76,7 @@ def test_short_games_are_not_favoured_and_scores_are_raw(truncate):
     result = play(env, games=5)
     assert result.returns == [7.0, 3.5, 7.0, 3.5, 7.0]
     assert result.lengths == [1, 3, 1, 3, 1]
-    assert result.frames.shape == (0, 1, 1)
+    assert result.frames.shape == (0, 1, 1, 1)
     assert len(env.actions) == 6  # not a step longer than the second long game
 
 
@@ -121,7 +121,7 @@ def test_what_the_policy_sees():
 
 def test_same_seed_same_games():
     def policy(frames, step, epsilon):
-        return ((frames[:, -1].astype(int).sum((1, 2)) + step) % 3).astype(np.int32)
+        return ((frames[:, -1].astype(int).sum((1, 2, 3)) + step) % 3).astype(np.int32)
 
     env = envs.make("CatchDistractor", num_envs=2, seed=0, frame_size=42, sticky_actions=0.0, noop_max=0)
     options = {"games": 3, "epsilon": 0.0, "max_steps": 40, "record": 30}

@@ -81,12 +81,14 @@ def make_encoder(features: int = 8) -> Encoder:
     return Encoder(linear(pixels, features), encode, features, shape, make_decoder)
 
 
-def make_window(seed: int = 0, *, batch: int = 4, horizon: int = 3, size: int = SIZE) -> Window:
+def make_window(
+    seed: int = 0, *, batch: int = 4, horizon: int = 3, size: int = SIZE, channels: int = 1
+) -> Window:
     """A random window within one episode: every offset valid, nothing terminal."""
     rng = np.random.default_rng(seed)
     shape = (batch, horizon)
     return Window(
-        frames=rng.integers(0, 256, (batch, STACK + horizon, size, size), dtype=np.uint8),
+        frames=rng.integers(0, 256, (batch, STACK + horizon, size, size, channels), dtype=np.uint8),
         actions=rng.integers(0, NUM_ACTIONS, shape, dtype=np.int32),
         rewards=rng.normal(size=shape).astype(np.float32),
         discounts=np.full(shape, 0.99, np.float32),

@@ -13,9 +13,9 @@ from tests.helpers import jit
 def transposed(x, kernel, bias, stride, size):
     """The textbook: zeros between the pixels, a flipped kernel, and padding up to the wanted size."""
     k = kernel.shape[0]
-    pad = (k - 1, k - 1 + size - ((x.shape[1] - 1) * stride + k))
+    pads = [(k - 1, k - 1 + to - ((n - 1) * stride + k)) for n, to in zip(x.shape[1:3], size, strict=True)]
     return bias + jax.lax.conv_general_dilated(
-        x, kernel[::-1, ::-1], (1, 1), [pad, pad], lhs_dilation=(stride, stride),
+        x, kernel[::-1, ::-1], (1, 1), pads, lhs_dilation=(stride, stride),
         dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest",
     )  # fmt: skip
 
@@ -69,24 +69,60 @@ def test_conv_is_the_plain_convolution_in_values_and_gradients(kernel, stride, h
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=2e-2), ours, theirs)
 
 
+@pytest.mark.parametrize("dtype", [np.float32, np.uint8])
 @pytest.mark.parametrize(
-    ("kernel", "stride", "height", "size"),
+    ("kernel", "stride", "shape", "padding"),
     [
-        (3, 1, 5, 7),
-        (4, 2, 3, 8),
-        (3, 2, 4, 9),
-        (3, 2, 4, 10),  # one row and column that no kernel reaches: the bias alone
-        (8, 4, 3, 19),
-        (6, 4, 4, 20),
-        (2, 3, 3, 9),  # a kernel smaller than its stride: gaps
-        (1, 1, 4, 4),
+        (3, 1, (5, 6), "SAME"),
+        (3, 2, (6, 7), "SAME"),  # the odd zero is below and on the right
+        (4, 2, (7, 6), "SAME"),
+        (8, 4, (16, 21), "SAME"),
+        (2, 3, (6, 8), "SAME"),  # nothing is missing
+        (3, 2, (6, 9), 2),
+        (4, 2, (7, 9), ((0, 1), (2, 0))),
+        (4, 2, (8, 11), "VALID"),
     ],
 )
-def test_conv_transpose_is_the_dilated_convolution_in_values_and_gradients(kernel, stride, height, size):
+def test_conv_pads_as_jax_does(kernel, stride, shape, padding, dtype):
+    rng = np.random.default_rng(0)
+    x = rng.integers(0, 256, (2, *shape, 3)).astype(dtype)
+    params = {
+        "kernel": rng.normal(size=(kernel, kernel, 3, 5)).astype(np.float32),
+        "bias": rng.normal(size=5).astype(np.float32),
+    }
+    ours = Conv(5, kernel, stride, padding=padding).apply({"params": params}, x)
+    theirs = params["bias"] + jax.lax.conv_general_dilated(
+        x.astype(np.float32), params["kernel"], (stride, stride), [(2, 2)] * 2 if padding == 2 else padding,
+        dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest",
+    )  # fmt: skip
+    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=2e-2)
+
+
+@pytest.mark.parametrize("padding", ["same", -1, ((0, 1),), ((0, 1), (0, -1))])
+def test_conv_refuses_other_padding(padding):
+    with pytest.raises(ValueError, match="padding must be VALID, SAME,"):
+        layers.padding_of(padding, (7, 7), 3, 2)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "stride", "shape", "size"),
+    [
+        (3, 1, (5, 5), (7, 7)),
+        (4, 2, (3, 3), (8, 8)),
+        (3, 2, (4, 4), (9, 9)),
+        (3, 2, (4, 4), (10, 10)),  # one row and column that no kernel reaches: the bias alone
+        (8, 4, (3, 3), (19, 19)),
+        (6, 4, (4, 4), (20, 20)),
+        (6, 4, (4, 3), (15, 17)),  # rows that are cut off, columns that no kernel reaches
+        (2, 3, (3, 3), (9, 9)),  # a kernel smaller than its stride: gaps
+        (1, 1, (4, 4), (4, 4)),
+    ],
+)
+def test_conv_transpose_is_the_dilated_convolution_in_values_and_gradients(kernel, stride, shape, size):
     layer = ConvTranspose(5, kernel, stride, size)
     rng = np.random.default_rng(0)
-    x = rng.normal(size=(2, height, height, 3)).astype(np.float32)
-    cotangent = rng.normal(size=(2, size, size, 5)).astype(np.float32)
+    x = rng.normal(size=(2, *shape, 3)).astype(np.float32)
+    cotangent = rng.normal(size=(2, *size, 5)).astype(np.float32)
     params = {
         "kernel": rng.normal(size=(kernel, kernel, 3, 5)).astype(np.float32),
         "bias": rng.normal(size=5).astype(np.float32),
@@ -105,7 +141,7 @@ def test_conv_transpose_is_the_dilated_convolution_in_values_and_gradients(kerne
 
 def test_conv_transpose_in_forward_mode():
     # Its rule is written by hand, so that either tangent alone and both together need a look.
-    layer = ConvTranspose(5, 3, 1, 7)
+    layer = ConvTranspose(5, 3, 1, (7, 7))
     rng = np.random.default_rng(0)
     x, x_dot = rng.normal(size=(2, 2, 5, 5, 3)).astype(np.float32)
     kernel, kernel_dot = rng.normal(size=(2, 3, 3, 3, 5)).astype(np.float32)
@@ -119,7 +155,7 @@ def test_conv_transpose_in_forward_mode():
             return both, of_kernel, jax.jvp(lambda x: f(kernel, x), (x,), (x_dot,))[1]
 
         ours = of(lambda kernel, x: layer.apply({"params": {"kernel": kernel, "bias": bias}}, x))
-        return ours, of(lambda kernel, x: transposed(x, kernel, bias, 1, 7))
+        return ours, of(lambda kernel, x: transposed(x, kernel, bias, 1, (7, 7)))
 
     ours, theirs = tangents(x, x_dot, kernel, kernel_dot)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4), ours, theirs)
@@ -151,7 +187,7 @@ def test_conv_transpose_by_hand():
     # row and column that no kernel reaches. The bias, 0.5, is everywhere.
     x = np.array([[1.0, 2.0], [3.0, 4.0]], np.float32)[None, :, :, None]
     kernel = np.array([[1.0, 10.0], [100.0, 1000.0]], np.float32)[:, :, None, None]
-    layer = ConvTranspose(1, 2, 2, 5)
+    layer = ConvTranspose(1, 2, 2, (5, 5))
     y = jit(layer.apply)({"params": {"kernel": kernel, "bias": np.array([0.5], np.float32)}}, x)
     expected = [
         [1, 10, 2, 20, 0],
@@ -163,10 +199,10 @@ def test_conv_transpose_by_hand():
     np.testing.assert_array_equal(y[0, :, :, 0], np.array(expected) + 0.5)
 
 
-@pytest.mark.parametrize("size", [6, 9])
+@pytest.mark.parametrize("size", [5, 9])
 def test_conv_transpose_refuses_sizes_that_its_mirror_could_not_have_seen(size):
-    # (3 - 1) * 2 + 3 = 7, and 8 with the pixel that stride 2 drops; nothing else.
-    layer = ConvTranspose(1, 3, 2, size)
+    # (3 - 1) * 2 + 3 = 7; 8 with the pixel that stride 2 drops, 6 with a row of zeros; nothing else.
+    layer = ConvTranspose(1, 3, 2, (7, size))
     with pytest.raises(ValueError, match=f"cannot make {size} pixels from 3"):
         jax.eval_shape(layer.init, jax.random.key(0), jnp.zeros((1, 3, 3, 1)))
 
@@ -197,8 +233,8 @@ def test_every_layer_knows_its_fan_in(monkeypatch):
         (WideDense(7), (1, 25), 25),
         (NoisyDense(7), (1, 25), 25),
         (Conv(6, 3, 1), (1, 5, 5, 4), 3 * 3 * 4),
-        (ConvTranspose(6, 3, 1, 7), (1, 5, 5, 4), 3 * 3 * 4),
-        (ConvTranspose(6, 8, 4, 24), (1, 5, 5, 4), 2 * 2 * 4),  # an output pixel sees 8 / 4 = 2 a side
+        (ConvTranspose(6, 3, 1, (7, 7)), (1, 5, 5, 4), 3 * 3 * 4),
+        (ConvTranspose(6, 8, 4, (24, 24)), (1, 5, 5, 4), 2 * 2 * 4),  # an output pixel sees 8 / 4 = 2 a side
     ]
     for layer, shape, fan_in in cases:
         arguments = [None] if isinstance(layer, NoisyDense) else []
@@ -223,7 +259,7 @@ def test_a_convolution_starts_as_asked():
 def test_init_scale_multiplies_the_kernel():
     x = jnp.zeros((1, 3, 3, 2))
     whole, tenth = (
-        jit(ConvTranspose(4, 4, 2, 8, "he", scale).init)(jax.random.key(0), x)["params"]
+        jit(ConvTranspose(4, 4, 2, (8, 8), "he", scale).init)(jax.random.key(0), x)["params"]
         for scale in (1.0, 0.1)
     )
     np.testing.assert_allclose(tenth["kernel"], 0.1 * whole["kernel"], rtol=1e-5)

@@ -13,9 +13,14 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
+from gymnasium.spaces import Box
+from gymnasium.vector.utils import batch_space
 
 from srl_jax import actor, checkpoint, ending, loading, loop, schedules
+from srl_jax.agent import make_agent
 from srl_jax.config import Config
+from srl_jax.diagnostics import heldout
+from srl_jax.envs.catch import Catch
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.modes import ENCODER_OPTIMIZERS
@@ -176,7 +181,7 @@ def test_rows_of_a_run(joint):
 def test_pictures_show_input_target_and_output(joint):
     _, result = joint
     (inputs, targets, outputs) = result.pictures["reconstruction"]
-    assert inputs.shape == targets.shape == outputs.shape == (6, 42, 42, 4)
+    assert inputs.shape == targets.shape == outputs.shape == (6, 42, 42, 1)
     np.testing.assert_allclose(inputs, targets, atol=1e-7)  # reconstruction's target is its input
     assert 0 <= inputs.min() and inputs.max() <= 1
 
@@ -186,7 +191,7 @@ def test_the_last_evaluation_was_recorded(joint):
     last = read_metrics(path / "metrics.jsonl")[-1]
     # Three games, one in each environment: the first one's frames, and the one that it began with.
     assert result.recording.dtype == np.uint8
-    assert result.recording.shape == (last["eval/lengths"][0] + 1, 42, 42)
+    assert result.recording.shape == (last["eval/lengths"][0] + 1, 42, 42, 1)
 
 
 def test_an_agent_comes_back_from_its_checkpoint(joint):
@@ -414,6 +419,59 @@ def test_a_row_that_cannot_be_written_ends_the_run_with_its_threads(tmp_path, mo
         train(tmp_path / "run", checkpoint_every=20)
     assert whole(tmp_path / "run").env_steps == 120  # before the evaluation whose row it is
     assert threading.active_count() <= before
+
+
+class Colour(Catch):
+    """Catch with a margin on its right, in three colours: frames of 42 x 50 pixels."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.single_observation_space = Box(0, 255, (42, 50, 3), np.uint8)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+
+    def _frames(self):
+        grey = super()._frames()
+        return np.concatenate([grey, grey // 2, 255 - grey], -1)
+
+
+def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
+    def make(game, *, num_envs, seed, frame_size, **options):
+        return Colour(num_envs=num_envs, seed=seed, size=frame_size)
+
+    objectives = ("reconstruction", "forward_pixels", "latent_l2")
+    values = {**SMALL, "steps": 120, "eval_every": 60, "diagnostics": True, "augment": "all"}
+    config = Config(**{**values, "mode": "joint", "objectives": objectives})
+    agent = make_agent(config, (42, 50, 3), 3)
+    rows = []
+    heldout._collect.cache_clear()
+    with monkeypatch.context() as patched:
+        patched.setattr("srl_jax.envs.make", make)
+        for path, stop_at in ((tmp_path / "whole", None), (tmp_path / "resumed", 16)):
+            path.mkdir()
+            asked = itertools.count(1)
+            stop = lambda at=stop_at, asked=asked: next(asked) == at  # noqa: E731
+            result = loop.train(config, path, progress=False, agent=agent, stop=stop)
+            if stop_at is not None:
+                assert result.interrupted and result.env_steps == 60
+                result = loop.train(config, path, progress=False, agent=agent, resume=whole(path))
+            rows.append([strip_wall(row) for row in read_metrics(path / "metrics.jsonl")])
+    heldout._collect.cache_clear()
+    assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 120
+    # What is seen, learnt, recorded and measured has the environment's shape.
+    assert result.recording.shape[1:] == (42, 50, 3)
+    np.testing.assert_array_equal(result.recording[..., 0], 255 - result.recording[..., 2])
+    for name in ("reconstruction", "forward_pixels"):
+        inputs, targets, outputs = result.pictures[name]
+        assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 50, 3)
+        np.testing.assert_allclose(targets[..., 0], 1 - targets[..., 2], atol=1e-6)
+        assert rows[0][-1][f"diag/error/{name}/moving"] > 0
+    # No environment is needed to know it.
+    loaded, _, manifest = loop.load_agent(path)
+    assert manifest.frame_shape == (42, 50, 3) and loaded.encoder.observation_shape == (42, 50, 12)
+    for flag in ("policy_from", "encoder_from"):
+        grey = Config(**{**SMALL, "mode": "pretrain", "objectives": ("latent_l2",), flag: str(path)})
+        with pytest.raises(ConfigError, match=rf"--{flag}=.* of \[42, 50, 3\], Catch shows \[42, 42, 1\]"):
+            loop.Run(grey, tmp_path, progress=False)
 
 
 def test_early_stop(tmp_path):

@@ -49,7 +49,7 @@ def small(mode, **values):
 @functools.cache
 def build(mode):
     """(agent, its update compiled quickly, an initial state on the host) of a small configuration."""
-    agent = make_agent(small(mode), NUM_ACTIONS)
+    agent = make_agent(small(mode), (FRAME, FRAME, 1), NUM_ACTIONS)
     return agent, jit(agent.update.pure), random_state(agent.init)
 
 
@@ -179,7 +179,7 @@ def test_no_td_error_without_rl():
 
 
 def test_an_update_of_rl_alone_takes_over_and_returns_only_what_it_moves():
-    agent = make_agent(small("joint", srl_every=2), NUM_ACTIONS)
+    agent = make_agent(small("joint", srl_every=2), (FRAME, FRAME, 1), NUM_ACTIONS)
     state = jax.tree.map(jax.numpy.asarray, random_state(agent.init))
     before = jax.tree.map(np.array, state.params)
     new, _, _ = agent.update_rl(state, WINDOW, agent.hyper)
@@ -202,7 +202,7 @@ def test_everything_is_float32_also_where_jax_may_use_64_bits(mode):
     for encoder, name in pairs:
         with jax.enable_x64(True):
             values = {"encoder": encoder, "rl": name, "mode": mode, "max_grad_norm": 1.0}
-            agent = make_agent(Config(objectives=terms, **values), NUM_ACTIONS)
+            agent = make_agent(Config(objectives=terms, **values), (84, 84, 1), NUM_ACTIONS)
             state = jax.eval_shape(agent.init.__wrapped__, jax.random.key(0))
             window = make_window(horizon=agent.horizon, size=84)
             after = jax.eval_shape(agent.update.pure, state, window, agent.hyper)
@@ -213,7 +213,7 @@ def test_everything_is_float32_also_where_jax_may_use_64_bits(mode):
 @functools.cache
 def two_updates_of_the_registry(mode):
     """Rules, and the states before, between and after, where every objective has a rule of its own."""
-    agent = make_agent(small(mode), NUM_ACTIONS)
+    agent = make_agent(small(mode), (FRAME, FRAME, 1), NUM_ACTIONS)
     context = Context.of(agent.encoder, NUM_ACTIONS)
     terms = {n: o for n, o in agent.objectives.items() if n == RL}
     if MODES[mode].representation:
@@ -277,7 +277,7 @@ def spr(context, *, steps: int = 5, tau: float = 0.99, projection: int = 6):
 @pytest.mark.parametrize("mode", ["joint", "pretrain"])
 def test_a_self_predictive_objective_has_a_slow_encoder_that_moves(mode, monkeypatch):
     monkeypatch.setitem(objectives.REGISTRY, "spr", spr)
-    agent = make_agent(dataclasses.replace(small(mode), objectives=("spr",)), NUM_ACTIONS)
+    agent = make_agent(dataclasses.replace(small(mode), objectives=("spr",)), (FRAME, FRAME, 1), NUM_ACTIONS)
     assert agent.horizon == 5 and agent.follow_every == 1
     update, follow = jit(agent.update.pure), jit(agent.follow.__wrapped__)
     window = make_window(size=FRAME, horizon=5)

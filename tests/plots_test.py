@@ -100,12 +100,10 @@ def test_losses_has_a_panel_for_each_loss_and_the_gradient_norm(tmp_path, drawn)
     assert scales == {"loss/falls": "log", "loss/signed": "linear", "gradient norm": "linear"}
 
 
-def test_image_panel_shows_newest_frames_and_their_difference(tmp_path, drawn):
-    targets = np.zeros((8, 84, 84, 4), np.float32)
-    targets[..., -1] = 0.5
+def test_image_panel_shows_images_and_their_difference(tmp_path, drawn):
+    targets = np.full((8, 84, 84, 1), 0.5, np.float32)
     outputs = targets.copy()
-    outputs[2, 10, 20, -1] = 0.75
-    outputs[2, 10, 20, 0] = 9.0  # an older frame: not shown
+    outputs[2, 10, 20] = 0.75
     path = plots.image_panel(targets, targets, outputs, tmp_path / "panel.png", "x")
     assert is_small_png(path)
     cells = np.array(drawn[0].axes[:24]).reshape(6, 4)
@@ -117,23 +115,39 @@ def test_image_panel_shows_newest_frames_and_their_difference(tmp_path, drawn):
     assert {cell.images[0].get_clim() for cell in cells[:, 3]} == {(0.0, 0.25)}
 
 
+def test_image_panel_shows_colour_in_colour(tmp_path, drawn):
+    targets = np.zeros((1, 8, 12, 3), np.float32)
+    targets[..., 0] = 1.0  # red
+    outputs = targets.copy()
+    outputs[0, 2, 3] = 1.5, -0.25, 0.0
+    assert is_small_png(plots.image_panel(targets, targets, outputs, tmp_path / "panel.png", "x"))
+    _, target, output, difference = (np.asarray(axes.images[0].get_array()) for axes in drawn[0].axes[:4])
+    np.testing.assert_array_equal(target, targets[0])
+    assert output[2, 3].tolist() == [1.0, 0.0, 0.0]  # clipped, as the difference is not
+    assert difference.shape == (8, 12) and difference[2, 3] == 0.5 == difference.sum()
+
+
 def test_image_panel_of_noise_is_still_small_and_a_perfect_output_is_fine(tmp_path):
-    noise = np.random.default_rng(0).uniform(size=(3, 84, 84, 4)).astype(np.float32)
+    noise = np.random.default_rng(0).uniform(size=(3, 84, 84, 1)).astype(np.float32)
     assert is_small_png(plots.image_panel(noise, noise, noise, tmp_path / "panel.png", "x"))
 
 
 @pytest.mark.parametrize(
-    ("shape", "dtype"), [((1, 84, 84, 3), float), ((84, 84, 4), float), ((1, 84, 84, 4), np.uint8)]
+    ("shape", "dtype"),
+    [((1, 84, 84, 3), float), ((84, 84, 1), float), ((1, 84, 84, 1), np.uint8), ((0, 84, 84, 1), float)],
 )
 def test_image_panel_refuses_other_images(tmp_path, shape, dtype):
-    good = np.zeros((1, 84, 84, 4), np.float32)
-    with pytest.raises(ValueError, match="image stacks must be"):
+    good = np.zeros((1, 84, 84, 1), np.float32)
+    with pytest.raises(ValueError, match="images must be"):
         plots.image_panel(good, np.zeros(shape, dtype), good, tmp_path / "panel.png", "x")
+    four = np.zeros((1, 84, 84, 4), np.float32)
+    with pytest.raises(ValueError, match=r"images must be \[B, H, W, 1\] or \[B, H, W, 3\]"):
+        plots.image_panel(four, four, four, tmp_path / "panel.png", "x")
 
 
-@pytest.mark.parametrize("channels", [(), (3,)])
+@pytest.mark.parametrize("channels", [1, 3])
 def test_gif_holds_the_frames(tmp_path, channels):
-    frames = np.zeros((3, 8, 6, *channels), np.uint8)
+    frames = np.zeros((3, 8, 6, channels), np.uint8)
     frames[1, 2, 3] = 255
     frames[2] = 255
     path = plots.gif(frames, tmp_path / "a.gif", fps=20, scale=2)
@@ -143,12 +157,20 @@ def test_gif_holds_the_frames(tmp_path, channels):
             image.seek(i)
             assert image.info["duration"] == 50
             pixels = np.asarray(image.convert("L"))
-            expected = frames[i] if not channels else frames[i, ..., 0]
-            np.testing.assert_array_equal(pixels, expected.repeat(2, 0).repeat(2, 1))
+            np.testing.assert_array_equal(pixels, frames[i, ..., 0].repeat(2, 0).repeat(2, 1))
+
+
+def test_gif_holds_colours(tmp_path):
+    frames = np.zeros((2, 8, 6, 3), np.uint8)
+    frames[1, 2:4, :, 2] = 255
+    with Image.open(plots.gif(frames, tmp_path / "a.gif", scale=1)) as image:
+        image.seek(1)
+        np.testing.assert_array_equal(np.asarray(image.convert("RGB")), frames[1])
 
 
 @pytest.mark.parametrize(
-    ("shape", "dtype"), [((2, 8, 6), float), ((2, 8, 6, 4), np.uint8), ((0, 8, 6), np.uint8)]
+    ("shape", "dtype"),
+    [((2, 8, 6, 1), float), ((2, 8, 6, 4), np.uint8), ((2, 8, 6), np.uint8), ((0, 8, 6, 1), np.uint8)],
 )
 def test_gif_refuses_other_frames(tmp_path, shape, dtype):
     with pytest.raises(ValueError, match="frame"):

@@ -117,7 +117,7 @@ def test_a_restored_replay_keeps_its_own_arrays():
 
 
 def step_of_one():
-    return (np.zeros(1, int), np.zeros(1), *np.zeros((3, 1), bool), np.zeros((1, 2, 2), np.uint8))
+    return (np.zeros(1, int), np.zeros(1), *np.zeros((3, 1), bool), np.zeros((1, 2, 1, 2), np.uint8))
 
 
 def wrong(name, index, value):
@@ -243,9 +243,9 @@ def test_whatever_is_restored_can_be_gone_on_with(case, data):
             replay.set_priorities(indices[:1], np.ones(1))
         if not replay.active.all():
             waiting = np.flatnonzero(~replay.active)
-            replay.begin(np.zeros((len(waiting), 2, 2), np.uint8), waiting)
+            replay.begin(np.zeros((len(waiting), 2, 1, 2), np.uint8), waiting)
         over = zeros.astype(bool) if i % 5 else ~zeros.astype(bool)
-        replay.add(zeros.astype(int), zeros, over, over, over, np.zeros((n, 2, 2), np.uint8))
+        replay.add(zeros.astype(int), zeros, over, over, over, np.zeros((n, 2, 1, 2), np.uint8))
         assert len(replay) == len(replay.sampleable()) == np.count_nonzero(replay.tree.leaves)
 
 
@@ -261,9 +261,9 @@ def test_changed_slots_are_those_whose_frames_differ(case, data):
         driver.step(row)
     frames = driver.replay.frames
     # No two frames are alike, and none is 0.
-    changed = (frames != before).any(axis=(0, 2, 3))
+    changed = (frames != before).any(axis=(0, 2, 3, 4))
     np.testing.assert_array_equal(driver.replay.changed_slots(since), changed)
-    ever = frames.any(axis=(0, 2, 3))
+    ever = frames.any(axis=(0, 2, 3, 4))
     np.testing.assert_array_equal(driver.replay.changed_slots(start), ever)
     written = int(driver.replay.next_position.max())
     assert ever.tolist() == [i < written for i in range(driver.replay.slots)]
@@ -303,7 +303,7 @@ def filled(steps=30, **options):
 
 def test_shapes_and_dtypes_are_the_contract():
     window, indices = filled(num_streams=2, stack=4, horizon=3).replay.sample(5, 0.4)
-    assert (window.frames.shape, window.frames.dtype) == ((5, 7, 2, 2), np.uint8)
+    assert (window.frames.shape, window.frames.dtype) == ((5, 7, 2, 1, 2), np.uint8)
     assert (window.actions.shape, window.actions.dtype) == ((5, 3), np.int32)
     for array in (window.rewards, window.discounts, window.valid):
         assert (array.shape, array.dtype) == ((5, 3), np.float32)
@@ -447,7 +447,7 @@ def test_the_seed_decides_the_samples():
 
 def test_an_ended_stream_must_begin():
     driver = Driver(num_streams=2)
-    step = (np.zeros(2, int), np.zeros(2), *np.zeros((3, 2), bool), np.zeros((2, 2, 2), np.uint8))
+    step = (np.zeros(2, int), np.zeros(2), *np.zeros((3, 2), bool), np.zeros((2, 2, 1, 2), np.uint8))
     with pytest.raises(RuntimeError, match=r"begin an episode before the next add.*\[0, 1\]"):
         driver.replay.add(*step)
     driver.step([STEP, TRUNCATED])
@@ -466,8 +466,9 @@ def test_an_ended_stream_must_begin():
         ("terminated", np.zeros(2, int)),
         ("truncated", np.zeros((2, 1), bool)),
         ("life_lost", None),
-        ("frames", np.zeros((2, 2, 2))),  # not uint8
-        ("frames", np.zeros((2, 2, 3), np.uint8)),
+        ("frames", np.zeros((2, 2, 1, 2))),  # not uint8
+        ("frames", np.zeros((2, 2, 2), np.uint8)),
+        ("frames", np.zeros((2, 1, 2, 2), np.uint8)),
     ],
 )
 def test_a_bad_step_is_refused_and_changes_nothing(field, value):
@@ -479,7 +480,7 @@ def test_a_bad_step_is_refused_and_changes_nothing(field, value):
         "terminated": np.zeros(2, bool),
         "truncated": np.zeros(2, bool),
         "life_lost": np.zeros(2, bool),
-        "frames": np.zeros((2, 2, 2), np.uint8),
+        "frames": np.zeros((2, 2, 1, 2), np.uint8),
     }
     with pytest.raises(ValueError, match=f"{field} must be"):
         driver.replay.add(**(step | {field: value}))
@@ -489,7 +490,7 @@ def test_a_bad_step_is_refused_and_changes_nothing(field, value):
 @pytest.mark.parametrize("streams", [[0, 0], [0, 2], [-1, 0], [[0, 1]]])
 def test_bad_streams_are_refused(streams):
     with pytest.raises(ValueError, match="streams|frames"):
-        Driver(num_streams=2).replay.begin(np.zeros((2, 2, 2), np.uint8), np.array(streams))
+        Driver(num_streams=2).replay.begin(np.zeros((2, 2, 1, 2), np.uint8), np.array(streams))
 
 
 @pytest.mark.parametrize(

@@ -116,7 +116,7 @@ def runs(tmp_path_factory):
         if arm == "joint":
             own |= {"steps": 300} if seed == 0 else {"steps": 300, "eval_games": 10}
         write_run(place, returns, speed=speed, diag=diag, seed=seed, **own)
-    frames = np.zeros((30, 42, 42), np.uint8)
+    frames = np.zeros((30, 42, 42, 1), np.uint8)
     plots.gif(frames, root / "Catch/rl/seed0/figures/play.gif")
     image = np.zeros((2, 8, 8, 1), np.float32)
     plots.image_panel(image, image, image, root / "Catch/joint/seed0/figures/reconstruction.png", "")
@@ -398,7 +398,8 @@ def test_large_pictures_are_made_smaller(tmp_path, noise):
     from experiments.reporting import pictures
 
     rng = np.random.default_rng(0)
-    frames = rng.integers(0, 256, (40, 42, 42), dtype=np.uint8) if noise else np.zeros((40, 42, 42), np.uint8)
+    shape = (40, 42, 42, 1)
+    frames = rng.integers(0, 256, shape, dtype=np.uint8) if noise else np.zeros(shape, np.uint8)
     path = plots.gif(frames, tmp_path / "play.gif", scale=2)
     limit = 25_000 if noise else path.stat().st_size
     found = pictures.taken(path, limit)
@@ -407,7 +408,7 @@ def test_large_pictures_are_made_smaller(tmp_path, noise):
         # Every second frame, for twice as long each, and the first ones of these.
         if noise:
             assert image.info["duration"] == 140 and 5 < image.n_frames < 20
-            np.testing.assert_array_equal(np.asarray(image.convert("L")), frames[0])
+            np.testing.assert_array_equal(np.asarray(image.convert("L")), frames[0, ..., 0])
     assert pictures.taken(tmp_path / "none.gif", limit) is None
 
 

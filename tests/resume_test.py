@@ -37,7 +37,7 @@ EVERY = {"steps": 200, "log_every": 40, "eval_every": 60, "checkpoint_every": 52
 @cache
 def agent_of(config):
     with mock.patch.object(jax, "jit", jit):  # compiles faster; what is compiled runs a few times only
-        return make_agent(config, 3)
+        return make_agent(config, (42, 42, 1), 3)
 
 
 def make_config(mode, **values):

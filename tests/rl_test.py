@@ -52,7 +52,7 @@ def make_case(seed=0):
     rewards, discounts = rewards * valid, discounts * valid
     weight = rng.random(BATCH)
     floats = [x.astype(np.float32) for x in (rewards, discounts, valid, weight)]
-    return online, slow, Window(np.zeros((BATCH, 7, 1, 1), np.uint8), actions, *floats)
+    return online, slow, Window(np.zeros((BATCH, 7, 1, 1, 1), np.uint8), actions, *floats)
 
 
 def network(head, z, dueling, noise=None):

@@ -13,7 +13,7 @@ from experiments import evaluate, runtime, train
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 CACHE = pathlib.Path("/cache/xla")
-YNN = runtime.XLA_FLAGS["sac_ae"][0]
+(YNN,) = runtime.XLA_FLAGS
 JAX_CACHE = {
     "JAX_COMPILATION_CACHE_DIR": "/cache/xla",
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -45,6 +45,24 @@ def test_the_wanted_environment():
     assert _wanted({}, gpu=True, works=_never) == JAX_CACHE
     assert _wanted({}, cache=None) == AT_START | {"XLA_FLAGS": YNN}
     assert _wanted({}, works=lambda flags: False) == AT_START | JAX_CACHE
+
+
+def test_an_encoder_that_nobody_has_measured_counts_as_large():
+    assert _wanted({}, "my_own:features=3") == _wanted({}, "sac_ae") == _wanted({}, "impala:width=2")
+
+
+def test_the_work_of_every_encoder_is_known_before_jax_is():
+    import jax
+
+    from srl_jax import encoders
+
+    observation = jax.ShapeDtypeStruct((1, 84, 84, 4), "uint8")
+    counted = {}
+    for name, row in encoders.REGISTRY.items():
+        encoder = row((84, 84, 4))
+        params = jax.eval_shape(encoder.init, jax.random.key(0))
+        counted[name] = jax.jit(encoder.apply).lower(params, observation).cost_analysis()["flops"] / 2e6
+    assert runtime.MULTIPLY_ADDS == pytest.approx(counted, rel=0.02)
 
 
 def test_what_the_user_has_set_stays():

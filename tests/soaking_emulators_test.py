@@ -24,7 +24,7 @@ class Game:
     num_envs, single_action_space = N, None
 
     class single_observation_space:
-        shape = (SIZE, SIZE)
+        shape = (SIZE, SIZE, 1)
 
     def __init__(self):
         self.rng = np.random.default_rng(0)
@@ -37,7 +37,7 @@ class Game:
         return {"life_lost": self.rng.random(N) < 0.1, "lives": lives} | counters
 
     def _frames(self):
-        return self.rng.integers(0, 256, (N, SIZE, SIZE), dtype=np.uint8)
+        return self.rng.integers(0, 256, (N, SIZE, SIZE, 1), dtype=np.uint8)
 
     def reset(self, *, options=None):
         self.played[options["reset_mask"] if options else slice(None)] = 0
@@ -54,7 +54,7 @@ class Game:
 def played(steps=60, slots=30):
     """A record of a game, and a replay that got the same."""
     record = emulators.Recorder(Game(), steps)
-    replay = Replay(capacity=N * slots, num_streams=N, frame_shape=(SIZE, SIZE), stack=STACK, gamma=GAMMA)
+    replay = Replay(capacity=N * slots, num_streams=N, frame_shape=(SIZE, SIZE, 1), stack=STACK, gamma=GAMMA)
     replay.begin(record.reset()[0])
     rng = np.random.default_rng(1)
     for _ in range(steps):

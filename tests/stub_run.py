@@ -29,7 +29,8 @@ def complete(name, config):
         file.write(b"1234")
     entry = {"bytes": 4, "sha256": hashlib.sha256(b"1234").hexdigest()}
     about = {
-        "format": 3,
+        "format": 4,
+        "frame_shape": [42, 42, 1],
         "num_actions": 3,
         "env_steps": 500,
         "updates": 1,

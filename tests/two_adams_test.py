@@ -98,7 +98,7 @@ def network():
         return error**2, {"td_error": error}
 
     def image(head, slow_head, latents, window, key):
-        pixels = window.frames[:, 0, :, 0].astype(jnp.float32) / 255
+        pixels = window.frames[:, 0, :, 0, 0].astype(jnp.float32) / 255
         return jnp.mean((latents.online(0) @ head - pixels) ** 2, -1), {}
 
     def l2(head, slow_head, latents, window, key):
@@ -113,7 +113,7 @@ def network():
 
 def window(pixels, actions, targets):
     ones = np.ones((BATCH, 1), np.float32)
-    frames = np.stack([pixels, pixels], 1)[..., None]
+    frames = np.stack([pixels, pixels], 1)[..., None, None]
     return Window(frames, actions[:, None], targets[:, None], ones, ones, ones[:, 0])
 
 

@@ -365,7 +365,7 @@ def test_a_gate_that_is_shut_costs_no_differentiation():
 
 # Acting
 
-FRAMES = np.random.default_rng(0).integers(0, 256, (500, 4, 6, 6), dtype=np.uint8)
+FRAMES = np.random.default_rng(0).integers(0, 256, (500, 4, 6, 6, 1), dtype=np.uint8)
 
 
 def q_values(head, latents, key=None):
@@ -382,7 +382,7 @@ def run_act(noisy, step, epsilon, key=0):
 
 _acts = {noisy: jit(make_act(PIXELS, q_values, noisy=noisy)) for noisy in (False, True)}
 # The latent's first four numbers are the four frames' first pixels, newest last.
-GREEDY = FRAMES[:, :, 0, 0].argmax(1)
+GREEDY = FRAMES[:, :, 0, 0, 0].argmax(1)
 
 
 def test_without_epsilon_and_noise_the_best_action_is_taken():

@@ -10,7 +10,7 @@ def numbered(batch=2, horizon=3):
     """A window whose frame i of row b is filled with 10 * b + i."""
     window = make_window(batch=batch, horizon=horizon, size=2)
     numbers = 10 * np.arange(batch)[:, None] + np.arange(STACK + horizon)
-    frames = np.broadcast_to(numbers[:, :, None, None], window.frames.shape)
+    frames = np.broadcast_to(numbers[:, :, None, None, None], window.frames.shape)
     return window._replace(frames=frames.astype(np.uint8))
 
 
@@ -41,8 +41,21 @@ def test_image_is_the_observation_in_the_unit_interval():
     np.testing.assert_array_equal(np.rint(seen * 255), observation(window, 1))
 
 
-def test_stack_last_moves_the_frames_to_the_end():
-    frames = np.arange(2 * 3 * 4 * 5).reshape(2, 3, 4, 5)
+def test_stack_last_moves_frames_and_their_channels_to_the_end():
+    frames = np.arange(2 * 3 * 4 * 5 * 2).reshape(2, 3, 4, 5, 2)
     stacked = np.asarray(stack_last(frames))
-    assert stacked.shape == (2, 4, 5, 3)
-    assert stacked[1, 2, 3, 0] == frames[1, 0, 2, 3]
+    assert stacked.shape == (2, 4, 5, 6)
+    # Channel s * C + c is c of frame s: the newest frame is the last two channels.
+    assert stacked[1, 2, 3].tolist() == [frames[1, s, 2, 3, c] for s in range(3) for c in range(2)]
+
+
+def test_colour_of_any_shape_stays_together():
+    # Frame i of row b has the colour (i, 10 + i, 20 + i) + 100 * b everywhere; 3 x 5 pixels.
+    number = 100 * np.arange(2)[:, None, None] + np.arange(STACK + 1)[:, None] + 10 * np.arange(3)
+    frames = np.broadcast_to(number[:, :, None, None], (2, STACK + 1, 3, 5, 3)).astype(np.uint8)
+    window = make_window(batch=2, horizon=1)._replace(frames=frames)
+    seen = observation(window, 1)
+    assert seen.shape == (2, 3, 5, 3 * STACK)
+    expected = [101, 111, 121, 102, 112, 122, 103, 113, 123, 104, 114, 124]
+    np.testing.assert_array_equal(seen[1, 2, 4], expected)
+    np.testing.assert_array_equal(jit(observation)(window, np.array([0, 1]))[1], seen[1])

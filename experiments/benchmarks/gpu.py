@@ -47,11 +47,11 @@ def updates(preset: str, repeats: int, seeds: int = 1) -> list[float]:
     """Milliseconds of a preset's updates, of so many seeds in one call."""
     import jax
 
-    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, random_window
+    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, frame_shape, random_window
     from srl_jax.agent import make_agent, over_seeds
 
     config = config_of(preset)
-    agent = make_agent(config, NUM_ACTIONS)
+    agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
     windows = [random_window(config, agent.horizon, i) for i in range(8)]
     count = iter(range(10**9))
     device = over_seeds(agent, seeds)

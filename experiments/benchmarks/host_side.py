@@ -117,12 +117,12 @@ class Replays:
         self._replay = Replay(
             capacity=CAPACITY,
             num_streams=STREAMS,
-            frame_shape=(SIDE, SIDE),
+            frame_shape=(SIDE, SIDE, 1),
             stack=STACK,
             horizon=HORIZON,
             seed=seed,
         )
-        pool = rng.integers(0, 256, (97, STREAMS, SIDE, SIDE), np.uint8)
+        pool = rng.integers(0, 256, (97, STREAMS, SIDE, SIDE, 1), np.uint8)
         zeros = np.zeros(STREAMS, bool)
         self._replay.begin(pool[0])
         for i in range(self._replay.slots + STACK):
@@ -133,7 +133,7 @@ class Replays:
             )
             if over.any():
                 self._replay.begin(pool[0][over], np.flatnonzero(over))
-        self._frames = self._replay.frames.reshape(-1, SIDE, SIDE)
+        self._frames = self._replay.frames.reshape(-1, SIDE, SIDE, 1)
         self._env = None
         self.sample(100)
         return {"versions": versions()}

@@ -40,11 +40,16 @@ def config_of(preset: str, **overrides: Any) -> Config:
     return resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
 
 
+def frame_shape(config: Config) -> tuple[int, int, int]:
+    """(H, W, C) of a preset's frames: all are of Atari games or Catch."""
+    return config.frame_size, config.frame_size, 1
+
+
 def random_window(config: Config, horizon: int, seed: int) -> Window:
     """A window of noise with the shapes of a run's; some rows end, or are cut, within the horizon."""
     rng = np.random.default_rng(seed)
-    batch, side = config.batch_size, config.frame_size
-    frames = rng.integers(0, 256, (batch, config.frame_stack + horizon, side, side), np.uint8)
+    batch = config.batch_size
+    frames = rng.integers(0, 256, (batch, config.frame_stack + horizon, *frame_shape(config)), np.uint8)
     end = np.where(rng.random(batch) < 0.1, rng.integers(0, horizon, batch), horizon)[:, None]
     steps = np.arange(horizon)
     valid = steps <= end
@@ -97,7 +102,7 @@ class Updates:
         from srl_jax.agent import make_agent
 
         self._config = config_of(preset, **overrides)
-        self._agent = make_agent(self._config, NUM_ACTIONS)
+        self._agent = make_agent(self._config, frame_shape(self._config), NUM_ACTIONS)
         self._state = self._agent.init(jax.random.key(self._config.seed), None)
         self._windows = [self._window(seed) for seed in range(WINDOWS)]
         self._count = 0
@@ -125,7 +130,8 @@ class Updates:
         np.savez(paths["params"], **weights)
         np.savez(paths["window"], **window._asdict())
         # Not the timed update: what is traced here has no noise in it.
-        agent = make_agent(dataclasses.replace(self._config, adam_eps=CHECK_ADAM_EPS), NUM_ACTIONS)
+        config = dataclasses.replace(self._config, adam_eps=CHECK_ADAM_EPS)
+        agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
         losses = []
         with mock.patch.object(heads, "factorised_noise", lambda key, size: np.zeros(size, np.float32)):
             for _ in range(updates):

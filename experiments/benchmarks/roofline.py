@@ -32,11 +32,11 @@ def update_cost(preset: str) -> Cost:
     """Counts a preset's update: XLA's count of operations before it optimises, and passes over parameters."""
     import jax
 
-    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, random_window
+    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, frame_shape, random_window
     from srl_jax.agent import make_agent
 
     config = config_of(preset)
-    agent = make_agent(config, NUM_ACTIONS)
+    agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
     state = jax.eval_shape(agent.init, jax.random.key(0))
     window = random_window(config, agent.horizon, 0)
     operations = jax.jit(agent.update.pure).lower(state, window, agent.hyper).cost_analysis()["flops"]

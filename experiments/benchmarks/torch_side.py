@@ -191,7 +191,8 @@ class Learner:
         Args:
             arm: a key of `ARMS`.
             params: srl_jax's `TrainState.params` and `.slow`, by path.
-            window: srl_jax's `Window`, frames uint8 [B, S + K, H, W] and the rest: one batch for all updates.
+            window: srl_jax's `Window`, grey frames uint8 [B, S + K, H, W, 1] and the rest: one batch for all
+                updates.
             num_actions: A.
             memory_format: of images and kernels.
             encoder_optimizer: "summed": one Adam on the sum of the losses; "separate": RL's Adam steps, then
@@ -202,6 +203,7 @@ class Learner:
             ValueError: parameters that do not fit the arm.
         """
         layers = ARMS[arm].layers
+        window = window | {"frames": window["frames"][..., 0]}
         channels = window["frames"].shape[1] - window["actions"].shape[1]
         sizes = [window["frames"].shape[-1]]
         for _, kernel, stride in layers:

@@ -149,7 +149,7 @@ def beside_gymnasium(game: str, steps: int) -> Iterator[tuple[bool, bool, np.nda
     def compare(frame, info, their_frame):
         counters = ale.lives(), ale.getFrameNumber(), ale.getEpisodeFrameNumber()
         agree = tuple(int(info[name][0]) for name in COUNTERS) == counters
-        return np.abs(frame[0].astype(int) - their_frame), agree
+        return np.abs(frame[0, :, :, 0].astype(int) - their_frame), agree
 
     def start():
         frame, info = ours.reset()
@@ -181,7 +181,7 @@ class Recorder:
 
     Attributes:
         rows: int64 [N], frames so far; row 0 is the first one.
-        frames: uint8 [N, R, H, W], named. names: int64 [N, R, 3].
+        frames: uint8 [N, R, H, W, 1], named. names: int64 [N, R, 3].
         actions, rewards: of the step that followed a frame. terminal: bool, its return ends there.
             truncated: bool. All [N, R].
         first_row, length: int64 [N, R], of an episode: the row of its first frame, and its steps so far.
@@ -254,7 +254,7 @@ class Recorder:
 
     def _name(self, frames):
         names = np.stack((self._all, self._episode, self._step), axis=1).astype("<i4")
-        frames[:, 0, :12] = names.view(np.uint8)
+        frames[:, 0, :12, 0] = names.view(np.uint8)
 
     def _keep(self, frames, which):
         rows = self.rows[which]
@@ -263,7 +263,7 @@ class Recorder:
         self.rows[which] += 1
 
     def right_stacks(self, stacks: np.ndarray) -> np.ndarray:
-        """Whether the stacks uint8 [N, S, H, W] are those of the newest frames: bool [N]."""
+        """Whether the stacks uint8 [N, S, H, W, 1] are those of the newest frames: bool [N]."""
         back = np.arange(1 - stacks.shape[1], 1)
         steps = np.maximum(self._step[:, None] + back, 0)
         names = np.stack(np.broadcast_arrays(self._all[:, None], self._episode[:, None], steps), axis=-1)
@@ -279,7 +279,7 @@ class Recorder:
         times = np.clip(steps[:, None] + np.arange(1 - stack, horizon + 1), 0, length)
         names = np.stack(np.broadcast_arrays(streams[:, None], episodes[:, None], times), axis=-1)
         right = (names_of(window.frames) == names).all((1, 2))
-        right &= (self.frames[streams[:, None], first + times] == window.frames).all((1, 2, 3))
+        right &= (self.frames[streams[:, None], first + times] == window.frames).all((1, 2, 3, 4))
         # So many steps were taken after it; where the episode goes on, all that the window shows.
         at = steps[:, None] + np.arange(horizon)
         valid = at < length
@@ -298,8 +298,8 @@ class Recorder:
 
 
 def names_of(frames: np.ndarray) -> np.ndarray:
-    """The names of frames uint8 [..., H, W]: int32 [..., 3]."""
-    return np.ascontiguousarray(frames[..., 0, :12]).view("<i4")
+    """The names of frames uint8 [..., H, W, 1]: int32 [..., 3]."""
+    return np.ascontiguousarray(frames[..., 0, :12, 0]).view("<i4")
 
 
 class Recorded(Run):
@@ -312,7 +312,8 @@ class Recorded(Run):
     def __init__(self, config: Config, folder: Path, steps: int, options: dict):
         self.wrong_stacks = 0
         # Parameters would only have to be compiled and drawn; nobody asks for them.
-        agent = make_agent(config, num_actions=18)._replace(init=lambda *_: SimpleNamespace(params=None))
+        frame = (config.frame_size, config.frame_size, 1)
+        agent = make_agent(config, frame, 18)._replace(init=lambda *_: SimpleNamespace(params=None))
 
         def make_env(config: Config, purpose: str, num_envs: int) -> Recorder:
             env = envs.make(

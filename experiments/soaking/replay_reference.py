@@ -138,7 +138,7 @@ class Driver:
         self.options = {
             "capacity": num_streams * slots + spare,
             "num_streams": num_streams,
-            "frame_shape": (2, 2),
+            "frame_shape": (2, 1, 2),
             "stack": stack,
             "horizon": horizon,
             "gamma": GAMMA,
@@ -154,7 +154,7 @@ class Driver:
 
     def new_frames(self, n):
         ids = np.array([next(self.count) for _ in range(n)], np.uint32)
-        return ids.view(np.uint8).reshape(n, 2, 2).copy()
+        return ids.view(np.uint8).reshape(n, 2, 1, 2).copy()
 
     def both(self, method, *arguments):
         """The result of a call; its twin's has to be the same to the bit."""

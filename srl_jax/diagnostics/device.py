@@ -17,10 +17,11 @@ class Functions(NamedTuple):
     """Jitted.
 
     Attributes:
-        encode: (encoder's parameters, frames uint8 [B, S, H, W]) -> float32 [B, D].
+        encode: (encoder's parameters, frames uint8 [B, S, H, W, C]) -> float32 [B, D].
         decode: {objective: (head, latents [B, D], Window) -> (errors [B], targets, outputs)}, of those with
             an image that the latent of s_t is enough for. Errors are squared and averaged over the image. Of
-            targets and outputs the newest two frames, float32 [B, H, W, 2] (of observations of one frame, 1).
+            targets and outputs the newest two frames, float32 [B, 2, H, W, C] (of observations of one frame,
+            [B, 1, H, W, C]).
         others: names of objectives with an image that need more than that.
         conflict: `srl_jax.update.make_conflict`'s; None where RL and representation losses do not both run.
     """
@@ -36,12 +37,18 @@ class MoreLatents(Exception):
 
 
 def make_functions(
-    encoder: Encoder, objectives: Mapping[str, Objective], mode: Mode, *, augment: str, target_encoder: str
+    encoder: Encoder,
+    objectives: Mapping[str, Objective],
+    mode: Mode,
+    *,
+    channels: int,
+    augment: str,
+    target_encoder: str,
 ) -> Functions:
-    """The functions of an agent; options as of `srl_jax.update.make_update`."""
+    """The functions of an agent; C is `channels`, other options are those of `srl_jax.update.make_update`."""
     images = {name: objective.image for name, objective in objectives.items() if objective.image}
     decode = {name: _decode(image) for name, image in images.items()}
-    ready = {n: f for n, f in decode.items() if _enough(f, objectives[n], encoder)}
+    ready = {n: f for n, f in decode.items() if _enough(f, objectives[n], encoder, channels)}
     conflict = None
     if mode.rl and mode.representation and len(objectives) > 1 and RL in objectives:
         conflict = jax.jit(
@@ -64,23 +71,29 @@ def _decode(image: Callable) -> Callable:
 
         target, output = image(head, Latents(known, known), window)
         errors = jnp.mean((output - target) ** 2, (1, 2, 3))
-        return errors, target[..., -2:], output[..., -2:]
+        channels = window.frames.shape[-1]
+        return errors, _newest(target, channels), _newest(output, channels)
 
     return decode
 
 
-def _enough(decode: Callable, objective: Objective, encoder: Encoder) -> bool:
+def _newest(image: Array, channels: int) -> Array:
+    """The newest two frames of an image, or the one where S is 1: [B, H, W, S * C] -> [B, 2, H, W, C]."""
+    frames = image.reshape(*image.shape[:3], -1, channels)[..., -2:, :]
+    return jnp.moveaxis(frames, -2, 1)
+
+
+def _enough(decode: Callable, objective: Objective, encoder: Encoder, channels: int) -> bool:
     """Whether an image can be made of the latent of s_t; compiles nothing."""
-    height, width, stack = encoder.observation_shape
+    height, width, depth = encoder.observation_shape
     steps = max(1, objective.horizon)
 
     def shape(dtype, *of):
         return jax.ShapeDtypeStruct((2, *of), dtype)
 
     numbers = [shape(jnp.float32, steps)] * 3
-    window = Window(
-        shape(jnp.uint8, stack + steps, height, width), shape(jnp.int32, steps), *numbers, shape(jnp.float32)
-    )
+    frames = shape(jnp.uint8, depth // channels + steps, height, width, channels)
+    window = Window(frames, shape(jnp.int32, steps), *numbers, shape(jnp.float32))
     head = jax.eval_shape(objective.init, jax.random.key(0))
     try:
         jax.eval_shape(decode, head, shape(jnp.float32, encoder.features), window)

@@ -42,7 +42,7 @@ class HeldOut(NamedTuple):
 
     @property
     def observations(self) -> np.ndarray:
-        """s_t: uint8 [N, S, H, W]."""
+        """s_t: uint8 [N, S, H, W, C]."""
         frames, horizon = self.windows.frames, self.windows.actions.shape[1]
         return frames[:, : frames.shape[1] - horizon]
 
@@ -218,7 +218,7 @@ class _Memory(_Unknown):
 
     def _check(self, i, frames, info):
         try:
-            self._twins[i].check(frames[i], int(info["frame_number"][i]), int(info["lives"][i]))
+            self._twins[i].check(frames[i, :, :, 0], int(info["frame_number"][i]), int(info["lives"][i]))
         except self._out_of_step as error:
             self.problem = f"the emulator whose memory is read is out of step: {error}"
             self.variables = ()

@@ -151,8 +151,8 @@ class Diagnostics:
             values[f"decoder_now/{name}"] = [crossed(name, head, then.latents) for then in kept.values()]
             values[f"decoder_now/{name}"] += [itself]
             values[f"encoder_now/{name}"] = []
-            if targets.shape[-1] == 2:  # else nothing tells what moves
-                found = measures.moving_errors(targets[..., 0], targets[..., 1], outputs[..., 1])
+            if targets.shape[1] == 2:  # else nothing tells what moves
+                found = measures.moving_errors(targets[:, 0], targets[:, 1], outputs[:, 1])
                 values |= {f"error/{name}/{what}": value for what, value in found.items()}
         for step in kept:
             then = self._read(step, params)

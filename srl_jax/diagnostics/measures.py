@@ -96,17 +96,17 @@ def moving_errors(before: np.ndarray, target: np.ndarray, output: np.ndarray) ->
     A decoder may give a game's background to the last detail and lose the ball: a hundredth of the pixels.
 
     Args:
-        before, target, output: float [N, H, W] in units of full brightness: the frame before the target's,
+        before, target, output: float [N, H, W, C] in units of full brightness: the frame before the target's,
             the target, and what was predicted.
 
     Returns:
         `moving`, `static`: mean squared error on the pixels of the target that differ from the frame before
-        by more than `MOVING`, and on the others. `moving_explained`: 1 - `moving` over the same error of the
-        targets' mean image, which knows nothing of an observation: 1 is perfect, 0 has lost what moves. NaN
-        where there is no such pixel.
+        by more than `MOVING` in any channel, and on the others. `moving_explained`: 1 - `moving` over the
+        same error of the targets' mean image, which knows nothing of an observation: 1 is perfect, 0 has lost
+        what moves. NaN where there is no such pixel.
     """
     target, output = target.astype(np.float64), output.astype(np.float64)
-    moves = np.abs(target - before) > MOVING
+    moves = (np.abs(target - before) > MOVING).any(-1)
     error, baseline = (output - target) ** 2, (target.mean(0) - target) ** 2
 
     def mean(values: np.ndarray, where: np.ndarray) -> float:
@@ -121,9 +121,10 @@ def moving_errors(before: np.ndarray, target: np.ndarray, output: np.ndarray) ->
 
 
 def moving_share(observations: np.ndarray) -> float:
-    """The share of pixels of the newest frame that move: uint8 [N, S, H, W], S at least 2."""
+    """The share of pixels of the newest frame that move, in any channel: uint8 [N, S, H, W, C], S at
+    least 2."""
     before, now = (observations[:, i].astype(np.float32) / 255.0 for i in (-2, -1))
-    return float((np.abs(now - before) > MOVING).mean())
+    return float((np.abs(now - before) > MOVING).any(-1).mean())
 
 
 def probe(latents: np.ndarray, states: np.ndarray, episodes: np.ndarray) -> np.ndarray:

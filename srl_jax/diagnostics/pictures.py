@@ -14,7 +14,9 @@ PICTURES = 6
 
 
 def pictures(agent: Agent, params: Any, replay: Replay, beta: float) -> dict[str, tuple]:
-    """{objective: (inputs, targets, outputs)}, float32 [B, H, W, S] each, of objectives that have an image.
+    """{objective: (inputs, targets, outputs)}, float32 [B, H, W, C] each, of objectives that have an image.
+
+    Of each observation the newest frame is shown.
 
     Args:
         agent: of the run.
@@ -32,6 +34,10 @@ def pictures(agent: Agent, params: Any, replay: Replay, beta: float) -> dict[str
         return {name: image(params[name], latents, window) for name, image in drawn.items()}
 
     made = jax.device_get(jax.jit(draw)(params, window))
-    stack = agent.encoder.observation_shape[-1]
-    inputs = np.moveaxis(window.frames[:, :stack], 1, -1).astype(np.float32) / 255.0
-    return {name: (inputs, target, output) for name, (target, output) in made.items()}
+    channels = replay.frame_shape[-1]
+    stack = agent.encoder.observation_shape[-1] // channels
+    inputs = window.frames[:, stack - 1].astype(np.float32) / 255.0
+    return {
+        name: (inputs, target[..., -channels:], output[..., -channels:])
+        for name, (target, output) in made.items()
+    }

@@ -1,14 +1,17 @@
 """The encoders: `REGISTRY[name](observation_shape, **options) -> Encoder`, a row each.
 
-`observation_shape` is (H, W, S). Each comes with the decoder that mirrors it, and all have the options
-`init`, `zero_sum`, `gain` and `decoder_scale`: see `srl_jax.encoders.convolutional.Start`.
+`observation_shape` is (H, W, S * C), of any size from the least that the layers fit. Each comes with the
+decoder that mirrors it, and all have the options `init`, `zero_sum`, `gain` and `decoder_scale`: see
+`srl_jax.encoders.convolutional.Start`. `flax_encoder` makes an encoder of any flax module.
 """
 
+from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder
+from srl_jax.encoders.impala import impala
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
-__all__ = ["REGISTRY", "nature", "sac_ae", "tiny"]
+__all__ = ["REGISTRY", "flax_encoder", "impala", "nature", "sac_ae", "tiny"]
 
 
 def nature(
@@ -76,4 +79,4 @@ def tiny(
     return convolutional_encoder(observation_shape, layers, start, features=features)
 
 
-REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny}
+REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny, "impala": impala}

@@ -1,14 +1,16 @@
 """Convolutional encoders and the decoders that mirror them, as tables of layers."""
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
 
+from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.layers import INITIALISERS, Conv, ConvTranspose, Dense, WideDense
 from srl_jax.specs import choices_text
-from srl_jax.types import Array, Decoder, Encoder
+from srl_jax.types import Array, Encoder
 
 LEAST_SEEN = 0.95
 """The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
@@ -57,12 +59,15 @@ class EncoderNetwork(nn.Module):
     Attributes:
         layers: the convolutions, from the image on.
         start: of the convolutions.
+        sizes: (height, width) of each layer's input, image first, and of the last layer's output. A layer has
+            zeros below and on the right of its input where its strides reach beyond it.
         features: the bottleneck's size; 0 leaves it out, and the flattened maps are the latent.
         layer_norm: LayerNorm between the bottleneck's linear layer and its tanh, as in SAC-AE.
     """
 
     layers: Sequence[Layer]
     start: Start
+    sizes: Sequence[tuple[int, int]]
     features: int = 0
     layer_norm: bool = True
 
@@ -75,7 +80,11 @@ class EncoderNetwork(nn.Module):
         for i, layer in enumerate(self.layers):
             # The first kernel is multiplied by the gain, not the image: the same, with fewer bytes.
             first = {"zero_sum": zero_sum, "gain": gain} if i == 0 else {}
-            x = nn.relu(Conv(*layer, init, **first)(x))
+            padding = tuple(
+                (0, max(0, (after - 1) * layer.stride + layer.kernel - before))
+                for before, after in zip(self.sizes[i], self.sizes[i + 1], strict=True)
+            )
+            x = nn.relu(Conv(*layer, init, **first, padding=padding)(x))
         x = x.reshape(x.shape[0], -1)
         if not self.features:
             return x
@@ -94,7 +103,7 @@ class DecoderNetwork(nn.Module):
     Attributes:
         layers: the encoder's.
         start: the encoder's.
-        sizes: side of each layer's input in the encoder, image first, and the last layer's output's.
+        sizes: the encoder's.
         channels: the image's channels.
         latent: the latent's size, without the extra inputs.
         bottleneck: whether the encoder ends in one.
@@ -103,7 +112,7 @@ class DecoderNetwork(nn.Module):
 
     layers: Sequence[Layer]
     start: Start
-    sizes: Sequence[int]
+    sizes: Sequence[tuple[int, int]]
     channels: int
     latent: int
     bottleneck: bool
@@ -111,12 +120,12 @@ class DecoderNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        side, maps = self.sizes[-1], self.layers[-1].channels
+        (height, width), maps = self.sizes[-1], self.layers[-1].channels
         if self.bottleneck:
-            x = nn.relu(WideDense(side * side * maps)(x)).reshape(-1, side, side, maps)
+            x = nn.relu(WideDense(height * width * maps)(x)).reshape(-1, height, width, maps)
         else:
             extra = x[:, None, None, self.latent :]
-            x = x[:, : self.latent].reshape(-1, side, side, maps)
+            x = x[:, : self.latent].reshape(-1, height, width, maps)
             extra = jnp.broadcast_to(extra, (*x.shape[:3], extra.shape[-1]))
             x = jnp.concatenate([x, extra], -1)
         outputs = [self.channels] + [layer.channels for layer in self.layers[:-1]]
@@ -141,7 +150,7 @@ def convolutional_encoder(
     """An `Encoder` from a table of layers.
 
     Args:
-        observation_shape: (H, W, S), with H = W.
+        observation_shape: (H, W, S * C).
         layers: its convolutions.
         start: how it starts.
         features: size of the bottleneck; 0 for none.
@@ -149,45 +158,45 @@ def convolutional_encoder(
         sigmoid: whether the decoder ends in a sigmoid (in (0, 1)) or is linear at the end.
 
     Raises:
-        ValueError: where the image is not square, too small for the layers, or the layers' strides leave
-            out more of its last rows and columns than 1 in 20; or `start` is out of range.
+        ValueError: where the image is too small for the layers, or `start` is out of range.
     """
     start.check()
-    height, width, channels = observation_shape
-    if height != width:
-        raise ValueError(f"frames must be square, not {height} x {width}")
-    sizes = [height]
-    for layer in layers:
-        if sizes[-1] < layer.kernel:
+    *sides, channels = observation_shape
+    layers = tuple(layers)
+    sizes = tuple(zip(*(layer_sides(side, layers) for side in sides), strict=True))
+    map_shape = *sizes[-1], layers[-1].channels
+    network = EncoderNetwork(layers, start, sizes, features, layer_norm)
+    latent = features or math.prod(map_shape)
+    decoder = DecoderNetwork(layers, start, sizes, channels, latent, bool(features), sigmoid)
+    return flax_encoder(network, decoder, observation_shape, map_shape=map_shape)
+
+
+def layer_sides(side: int, layers: Sequence[Layer]) -> list[int]:
+    """The side, in pixels, of each layer's input and of the last one's output.
+
+    Strides that do not fit leave out the last rows and columns, as they do in other projects, where that is
+    less than 1 in 20 of the image (`LEAST_SEEN`). Where it is more, every layer whose strides do not fit gets
+    zeros below and on the right: no layer leaves anything out.
+
+    Raises:
+        ValueError: the image is too small for the layers.
+    """
+
+    def through(up: bool) -> list[int]:
+        sides = [side]
+        for _, kernel, stride in layers:
+            sides.append((sides[-1] - kernel + up * (stride - 1)) // stride + 1)
+        return sides
+
+    down, up = through(False), through(True)
+    seen = down[-1]
+    for _, kernel, stride in reversed(layers):
+        seen = (seen - 1) * stride + kernel
+    sides = down if down[-1] > 0 and seen >= LEAST_SEEN * side else up
+    for before, layer in zip(sides, layers, strict=False):
+        if before < layer.kernel:
+            kernel = layer.kernel
             raise ValueError(
-                f"frames of {height} pixels are too small: a kernel of {layer.kernel} would see {sizes[-1]}"
+                f"frames of {side} pixels are too small: a kernel of {kernel} would see {before}"
             )
-        sizes.append((sizes[-1] - layer.kernel) // layer.stride + 1)
-    seen = sizes[-1]
-    for layer in reversed(layers):
-        seen = (seen - 1) * layer.stride + layer.kernel
-    if seen < LEAST_SEEN * height:
-        raise ValueError(
-            f"of frames of {height} pixels these layers see {seen} x {seen} and leave out the rest; "
-            f"{seen} fits"
-        )
-    layers, sizes = tuple(layers), tuple(sizes)
-    network = EncoderNetwork(layers, start, features, layer_norm)
-    latent = features or sizes[-1] ** 2 * layers[-1].channels
-    image = jnp.zeros((1, *observation_shape), jnp.float32)
-
-    def make_decoder(extra_inputs: int = 0) -> Decoder:
-        decoder = DecoderNetwork(layers, start, sizes, channels, latent, bool(features), sigmoid)
-        z = jnp.zeros((1, latent + extra_inputs), jnp.float32)
-        return Decoder(
-            init=lambda key: decoder.init(key, z)["params"],
-            apply=lambda params, x: decoder.apply({"params": params}, x),
-        )
-
-    return Encoder(
-        init=lambda key: network.init(key, image)["params"],
-        apply=lambda params, x: network.apply({"params": params}, x),
-        features=latent,
-        observation_shape=(height, width, channels),
-        make_decoder=make_decoder,
-    )
+    return sides

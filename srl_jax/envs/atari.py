@@ -126,7 +126,7 @@ class Atari(FrameVectorEnv):
         super().__init__(
             num_envs=num_envs,
             seed=seed,
-            frame_size=frame_size,
+            frame_shape=(frame_size, frame_size, 1),
             action_meanings=tuple(action.name for action in self._envs.ale.get_action_set()),
         )
         self._reseed_every = reseed_every
@@ -153,7 +153,7 @@ class Atari(FrameVectorEnv):
         self._log_lengths[due] = 0
         self._log_longest = int(self._log_lengths.max())
         self._append(np.flatnonzero(mask & ~due), RESET)
-        return frames[:, 0].copy(), self._info(info, np.zeros(self.num_envs, bool))
+        return shown(frames), self._info(info, np.zeros(self.num_envs, bool))
 
     def _step(self, actions):
         frames, rewards, terminated, truncated, info = self._envs.step(actions)
@@ -162,7 +162,7 @@ class Atari(FrameVectorEnv):
         life_lost = info["lives"] < self._lives
         self._lives = np.array(info["lives"])
         return (
-            frames[:, 0].copy(),
+            shown(frames),
             rewards.astype(np.float32),
             np.array(terminated),
             np.array(truncated),
@@ -194,7 +194,7 @@ class Atari(FrameVectorEnv):
         return self._reset_ale(np.zeros(self.num_envs, bool), self.ale_seeds)
 
     def _seen(self):
-        return self._look()[0][:, 0].copy()
+        return shown(self._look()[0])
 
     def _forms(self):
         number = (self.num_envs,)
@@ -282,6 +282,11 @@ class Atari(FrameVectorEnv):
     def close_extras(self, **kwargs):
         """Ends ALE's threads."""
         self._envs = None
+
+
+def shown(frames: np.ndarray) -> np.ndarray:
+    """ALE's stacks of one frame, uint8 [N, 1, H, W], as frames of the caller's own, uint8 [N, H, W, 1]."""
+    return frames[:, 0, :, :, None].copy()
 
 
 def logs_of(arrays: Mapping[str, np.ndarray]) -> list[np.ndarray]:

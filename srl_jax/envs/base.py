@@ -28,7 +28,7 @@ class Form(NamedTuple):
 
 
 class FrameVectorEnv(VectorEnv):
-    """N copies of a game that show one greyscale frame each; stacking is the caller's business.
+    """N copies of a game that show one frame each; stacking is the caller's business.
 
     Nothing resets by itself. The caller resets ended environments at once, by mask::
 
@@ -46,7 +46,7 @@ class FrameVectorEnv(VectorEnv):
     resets or on other environments; `numpy.random.SeedSequence` keeps neighbouring seeds apart.
 
     Attributes:
-        single_observation_space: Box(uint8, (H, W)).
+        single_observation_space: Box(uint8, (H, W, C)); C is 1 for grey, 3 for colour.
         single_action_space: Discrete(A).
         action_meanings: the A names of the actions.
     """
@@ -54,8 +54,8 @@ class FrameVectorEnv(VectorEnv):
     # Not inherited: ale_py writes its own mode into the dict of gymnasium's base class.
     metadata = {"autoreset_mode": AutoresetMode.DISABLED}
 
-    def __init__(self, *, num_envs: int, seed: int, frame_size: int, action_meanings: tuple):
-        """Sets up the spaces and the seeds.
+    def __init__(self, *, num_envs: int, seed: int, frame_shape: tuple, action_meanings: tuple):
+        """Sets up the spaces and the seeds; `frame_shape` is (H, W, C).
 
         Raises:
             ValueError: num_envs is not positive or seed is negative.
@@ -64,7 +64,7 @@ class FrameVectorEnv(VectorEnv):
             raise ValueError(f"num_envs must be at least 1, got {num_envs}")
         self.num_envs = num_envs
         self.action_meanings = tuple(action_meanings)
-        self.single_observation_space = Box(0, 255, (frame_size, frame_size), np.uint8)
+        self.single_observation_space = Box(0, 255, frame_shape, np.uint8)
         self.single_action_space = Discrete(len(self.action_meanings))
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -84,7 +84,7 @@ class FrameVectorEnv(VectorEnv):
                 reset must be a full one.
 
         Returns:
-            frames: uint8 [N, H, W].
+            frames: uint8 [N, H, W, C].
             info: as `step`'s.
 
         Raises:
@@ -112,7 +112,7 @@ class FrameVectorEnv(VectorEnv):
             actions: int32 or int64 [N], each in [0, A).
 
         Returns:
-            frames: uint8 [N, H, W]; an ended environment's is the last frame of its episode.
+            frames: uint8 [N, H, W, C]; an ended environment's is the last frame of its episode.
             rewards: float32 [N], the game's own score, not clipped.
             terminated: bool [N], the game is over. A lost life is not the end of a game.
             truncated: bool [N], stopped by the limit of frames and not terminated.
@@ -163,7 +163,7 @@ class FrameVectorEnv(VectorEnv):
             snapshot: from `snapshot` of an environment that was made with the same arguments.
 
         Returns:
-            The frames as they were last seen, uint8 [N, H, W].
+            The frames as they were last seen, uint8 [N, H, W, C].
 
         Raises:
             ValueError: an array is missing, unknown, of another dtype or shape, or out of range:
@@ -218,7 +218,7 @@ class FrameVectorEnv(VectorEnv):
         raise NotImplementedError
 
     def _seen(self) -> np.ndarray:
-        """The frames as they were last seen, uint8 [N, H, W], as an array of the caller's."""
+        """The frames as they were last seen, uint8 [N, H, W, C], as an array of the caller's."""
         raise NotImplementedError
 
     def _reset(self, mask: np.ndarray, seeded: bool) -> tuple:

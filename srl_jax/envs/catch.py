@@ -91,7 +91,7 @@ class Catch(FrameVectorEnv):
         """
         if size not in (GRID, GRID // 2):
             raise ValueError(f"the frame size of Catch must be 84 or 42, got {size}")
-        super().__init__(num_envs=num_envs, seed=seed, frame_size=size, action_meanings=ACTIONS)
+        super().__init__(num_envs=num_envs, seed=seed, frame_shape=(size, size, 1), action_meanings=ACTIONS)
         self._ball_x, self._ball_y, self._drift, self._fall, self._paddle = np.zeros((5, num_envs), np.int64)
         self._episodes = np.zeros(num_envs, np.int64)
         scale = GRID // size
@@ -179,14 +179,14 @@ class Catch(FrameVectorEnv):
         }
 
     def _frames(self):
-        shape = (self.num_envs, *self.single_observation_space.shape)
+        shape = (self.num_envs, *self.single_observation_space.shape[:2])
         frames = np.zeros(shape, np.uint8) if self._background is None else self._background.draw()
         index, cover = self._paddle_sprite
         self._draw(frames, *self._paddle_height, index[self._paddle], cover[self._paddle])
         index, cover = self._ball_sprite
         y, x = self._ball_y, self._ball_x
         self._draw(frames, index[y], cover[y], index[x], cover[x])
-        return frames
+        return frames[..., None]
 
     def _draw(self, frames, rows, row_cover, columns, column_cover):
         """Blends one bright rectangle per environment into the frames, by the area it covers."""

@@ -11,7 +11,7 @@ def mean_squared_error(output: Array, target: Array) -> jax.Array:
     """The squared error of an image, averaged over all its pixels and channels.
 
     Args:
-        output, target: float32 [H, W, S], in units of full brightness; a target is in [0, 1].
+        output, target: float32 [H, W, S * C], in units of full brightness; a target is in [0, 1].
 
     Returns:
         float32 []. A mean, not a sum: at 84 x 84 x 4 the two differ by a factor of 28,224.
