@@ -14,14 +14,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.flags import RL_OPTIONS
-from experiments.presets import PRESETS
 from srl_jax.config import INFOS
 from srl_jax.data import thesis_curve
 from srl_jax.envs import CATCH
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text, near
+
+from .flags import RL_OPTIONS
+from .presets import PRESETS
 
 
 class FigureArm(NamedTuple):

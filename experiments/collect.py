@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.directories import natural, runs_below
-from experiments.draw import read_rows
 from srl_jax import ending
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
+
+from .directories import natural, runs_below
+from .draw import read_rows
 
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""

@@ -18,18 +18,19 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import collect, curves, plots, sweep
-from experiments import flags as config_flags
-from experiments.arms import FIGURES, Figure, figures_named
-from experiments.collect import RunData, comparable, steps_and_returns
-from experiments.colours import styles
-from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
 from srl_jax import display, statistics
 from srl_jax.config import Config
 from srl_jax.data import published, reference_policies
 from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
+
+from . import collect, curves, plots, sweep
+from . import flags as config_flags
+from .arms import FIGURES, Figure, figures_named
+from .collect import RunData, comparable, steps_and_returns
+from .colours import styles
+from .sweeping.plan import Arm, Planned, parse_seeds, plan
 
 FLAGS = flags.FLAGS
 
@@ -336,6 +337,11 @@ def main(argv: list[str]) -> int:
     return run(FLAGS)
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     define_flags()
     config_flags.run(main)
+
+
+if __name__ == "__main__":
+    cli()

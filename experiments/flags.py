@@ -13,11 +13,12 @@ from typing import Any, NoReturn
 
 from absl import app, flags
 
-from experiments.presets import ENCODER_PRESETS, PRESETS, preset_values
 from srl_jax import display, modes, specs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import EXIT_STATUS, ConfigError
 from srl_jax.specs import Info
+
+from .presets import ENCODER_PRESETS, PRESETS, preset_values
 
 # The flags count as the entry point's own, so that --help shows them.
 flags.disclaim_key_flags()

@@ -21,9 +21,10 @@ import tempfile
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 
-from experiments import control_groups
 from srl_jax import display
 from srl_jax.errors import ConfigError
+
+from . import control_groups
 
 GUARD = "SRL_JAX_RUNTIME"
 """Set in the process that `prepare` started; such a process is not started again."""

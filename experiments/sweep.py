@@ -17,16 +17,17 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments.sweeping import launching, local, machine, manifest, plan, resolving, speed, table
-from experiments.sweeping.launching import Launcher, Outcome
-from experiments.sweeping.manifest import Entry
-from experiments.sweeping.plan import Planned
 from srl_jax import display, rundir
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import hms
 from srl_jax.specs import Info, value_text
+
+from . import flags as config_flags
+from .sweeping import launching, local, machine, manifest, plan, resolving, speed, table
+from .sweeping.launching import Launcher, Outcome
+from .sweeping.manifest import Entry
+from .sweeping.plan import Planned
 
 FLAGS = flags.FLAGS
 
@@ -158,7 +159,7 @@ def run_sweep(
     rundir.check_free(root)
     executor: Launcher
     if launcher == "ray":
-        from experiments.sweeping.ray_launcher import Ray
+        from .sweeping.ray_launcher import Ray
 
         executor = Ray(root, workers, cpus_per_run, gpus_per_run, retries, ray_address, command)
     else:
@@ -302,6 +303,11 @@ def main(argv: list[str]) -> int:
     return outcome.status
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     define_flags()
     config_flags.run(main)
+
+
+if __name__ == "__main__":
+    cli()

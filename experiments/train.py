@@ -16,15 +16,16 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import runtime
-from experiments.directories import all_to_resume, check_out, going_on, run_directory, say_anew
-from experiments.stopping import signals
 from srl_jax import display
 from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.rundir import check_free
 from srl_jax.specs import build, parse
+
+from . import flags as config_flags
+from . import runtime
+from .directories import all_to_resume, check_out, going_on, run_directory, say_anew
+from .stopping import signals
 
 FLAGS = flags.FLAGS
 
@@ -206,8 +207,8 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
     Raises:
         SaveError: they cannot be written.
     """
-    from experiments import plots
-    from experiments.draw import draw_run
+    from . import plots
+    from .draw import draw_run
 
     if not plots.available():
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
@@ -225,6 +226,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     return train(FLAGS, prepare)
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     define_flags()
     config_flags.run(functools.partial(main, prepare=runtime.prepare))
+
+
+if __name__ == "__main__":
+    cli()

@@ -17,10 +17,11 @@ from unittest import mock
 
 import numpy as np
 
-from experiments.flags import RL_OPTIONS, last_of_each
 from srl_jax import checkpoint
 from srl_jax.config import INFOS, Config
 from srl_jax.specs import Info
+
+from ..flags import RL_OPTIONS, last_of_each
 
 FLAGS, PRESETS, SPECS = "flags", "presets", "objectives and other specs"
 TOGETHER, MANIFESTS, CONFIGS = "flags that contradict each other", "manifests", "configs and metrics"
@@ -79,9 +80,10 @@ def make_valid_run(run: Path) -> None:
     """A run directory as training leaves it: config.json, metrics.jsonl and one checkpoint, of zeros."""
     import jax
 
-    from experiments.train import resolved
     from srl_jax.agent import make_agent
     from srl_jax.metrics import MetricsWriter
+
+    from ..train import resolved
 
     config = resolved(Config(**SETTINGS))
     run.mkdir(parents=True)

@@ -6,11 +6,13 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from experiments.presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS
 from srl_jax.config import INFOS
 from srl_jax.envs import GAMES
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
+
+from .. import PACKAGE
+from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS
 
 Flags = Mapping[str, str | tuple[str, ...]]
 """Flags of experiments.train as typed on the command line; a tuple's is repeated."""
@@ -209,7 +211,7 @@ def command(run: Planned, root: str | os.PathLike = "") -> list[str]:
         root: the sweep's; empty for a process that works there. Launchers do that: config.json then names
             what a run starts from as it lies under the root, wherever that is.
     """
-    found = [sys.executable, "-m", "experiments.train", *settings(run)]
+    found = [sys.executable, "-m", f"{PACKAGE}.train", *settings(run)]
     for flag in SOURCES:
         if source := getattr(run, flag):
             found.append(f"--{flag}={os.path.join(root, source)}")

@@ -11,14 +11,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments import directories
-from experiments.sweeping import manifest as manifests
 from srl_jax import checkpoint, rundir
 from srl_jax.checkpoint import NUMBERS, PARAMS
 from srl_jax.config import Config, another_run, difference
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import Mark
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
+
+from .. import directories
+from . import manifest as manifests
 
 
 class State(NamedTuple):
