@@ -10,7 +10,7 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax import display
+from srl_jax import display, plugins
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
 
@@ -74,6 +74,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     from srl_jax import loop
     from srl_jax.evaluate import evaluate
 
+    plugins.load(map(plugins.located, FLAGS["import"].value or config.imports))
     agent, params, manifest = loop.load_agent(FLAGS.run)
     number = min(FLAGS.games, config.num_envs)
     env = loop.make_env(config, number, FLAGS.seed, max_steps=config.eval_max_steps)
@@ -114,6 +115,8 @@ def cli() -> None:
     config_flags.define("seed", seed, 0)
     epsilon = "probability of a random action; the run's eps_eval if not given"
     config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None)
+    imports = "what to import in place of what the run's config.json names; may be repeated"
+    flags.DEFINE_multi_string("import", None, imports)
     flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF")
     config_flags.define_runtime_flag()
     config_flags.run(functools.partial(main, prepare=runtime.prepare), positional="run")

@@ -13,7 +13,7 @@ from typing import Any, NoReturn
 
 from absl import app, flags
 
-from srl_jax import display, modes, specs
+from srl_jax import display, modes, plugins, specs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import EXIT_STATUS, ConfigError
 from srl_jax.specs import Info
@@ -150,9 +150,12 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
         for name, info in INFOS.items()
         if values[info.flag or name].present
     }
-    if "objectives" in given:
-        texts = tuple(given["objectives"])
-        given["objectives"] = () if texts in (("none",), ("",)) else texts
+    for name in ("objectives", "imports"):
+        if name in given:
+            texts = tuple(given[name])
+            given[name] = () if texts in (("none",), ("",)) else texts
+    if "imports" in given:
+        given["imports"] = tuple(map(plugins.located, given["imports"]))
     preset = values["preset"].value
     settings = dict(given)
     if values["preset"].present:

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax import display
+from srl_jax import display, plugins
 from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.rundir import check_free
@@ -110,13 +110,16 @@ def interrupt() -> None:
 
 
 def resolved(config: Config) -> Config:
-    """`srl_jax.config.resolve` with the project's registries, and a trial build; imports jax.
+    """`srl_jax.config.resolve` with the registries and what --import adds, and a trial build; imports jax.
 
     Raises:
-        ConfigError: a specification is not valid, or cannot be built for these frames.
+        ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
+            these frames.
     """
     from srl_jax import encoders, objectives, rl
     from srl_jax.types import Context
+
+    plugins.load(config.imports)
 
     full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
     # Options may be valid one by one and not together, or not for these frames: only a factory

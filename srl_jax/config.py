@@ -193,12 +193,19 @@ class Config:
         str, "", "run directory or checkpoint whose policy --mode=pretrain acts with; empty: random"
     )
     pretrain_epsilon: float = _share(0.3, "epsilon of the policy that --mode=pretrain acts with")
+    imports: tuple[str, ...] = _value(
+        tuple, (),
+        "file (my_file.py) or module that registers objectives, encoders or RL algorithms of your own, see "
+        "srl_jax/plugins.py; may be repeated",
+        flag="import",
+    )  # fmt: skip
 
     def __post_init__(self):
-        if isinstance(self.objectives, list):
-            object.__setattr__(self, "objectives", tuple(self.objectives))
         for name, info in INFOS.items():
             value = getattr(self, name)
+            if info.kind is tuple and isinstance(value, list):
+                value = tuple(value)
+                object.__setattr__(self, name, value)
             # JSON and people write 1 for 1.0; one type keeps the round trip exact.
             if info.kind is float and type(value) is int and abs(value) <= specs.LIMITS[float]:
                 value = float(value)
@@ -313,9 +320,9 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
 
 
 def another_run(there: Config, here: Config) -> str:
-    """`difference` of what makes two runs two: the runs that they start from may lie elsewhere by now."""
+    """`difference` of what makes two runs two: what they start from and import may lie elsewhere by now."""
     same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
-    return difference(there, dataclasses.replace(here, **same))
+    return difference(there, dataclasses.replace(here, **same, imports=there.imports))
 
 
 def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:

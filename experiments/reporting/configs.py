@@ -119,6 +119,8 @@ def _fields(config: Config) -> dict[str, str]:
             continue
         if field in SPECIFICATIONS:
             found |= _options(field, value)
+        elif field == "imports":
+            found[field] = ", ".join(Path(text).name for text in value) or "none"
         elif value and field in collect.OF_A_SEED:
             found[field] = source_name(value)
         else:

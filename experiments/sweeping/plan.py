@@ -6,6 +6,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+from srl_jax import plugins
 from srl_jax.config import INFOS
 from srl_jax.envs import GAMES
 from srl_jax.errors import ConfigError
@@ -94,10 +95,11 @@ def plan(
     Raises:
         ConfigError: a name is unknown, or two runs would have the same one.
     """
-    flags = dict(flags or {})
+    flags = _checked("", flags or {})
     by_name: dict[str, Arm] = {}
     for arm in arms:
         _check(arm)
+        arm = arm._replace(flags=_checked(f"arm {arm.name}: ", arm.flags))
         if by_name.setdefault(arm.name, arm) != arm:
             raise ConfigError(
                 f"arm {arm.name}: there twice, of {by_name[arm.name].preset} and of {arm.preset}; "
@@ -106,7 +108,6 @@ def plan(
     for game in games:
         if game not in GAMES:
             raise ConfigError(f"--games={game}: {choices_text(game, GAMES)}")
-    _check_flags("", flags)
 
     runs: dict[str, Planned] = {}
 
@@ -146,13 +147,18 @@ def _check(arm: Arm) -> None:
         raise ConfigError(f"arm {arm.name}: a name is made of letters, digits and _ - . =")
     if ".broken-" in arm.name:
         raise ConfigError(f"arm {arm.name}: .broken- marks what was moved aside; give it another name")
-    _check_flags(f"arm {arm.name}: ", arm.flags)
 
 
-def _check_flags(where: str, flags: Flags) -> None:
+def _checked(where: str, flags: Flags) -> dict[str, str | tuple[str, ...]]:
+    """The flags, with the files that they import named so that a process finds them that works elsewhere."""
     for flag, mine in OWN.items():
         if flag in flags:
             raise ConfigError(f"{where}--{flag}: a sweep gives it to each run; --{mine} decides it")
+    own = dict(flags)
+    if "import" in own:
+        texts = (own["import"],) if isinstance(own["import"], str) else own["import"]
+        own["import"] = tuple(text if text == "none" else plugins.located(text) for text in texts)
+    return own
 
 
 def _pretraining(steps: str | tuple[str, ...]) -> str:

@@ -5,10 +5,11 @@
 """
 
 from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder
+from srl_jax.plugins import Registry
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
-__all__ = ["REGISTRY", "nature", "sac_ae", "tiny"]
+__all__ = ["REGISTRY", "register", "nature", "sac_ae", "tiny"]
 
 
 def nature(
@@ -76,4 +77,5 @@ def tiny(
     return convolutional_encoder(observation_shape, layers, start, features=features)
 
 
-REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny}
+REGISTRY = Registry("encoders", {"nature": nature, "sac_ae": sac_ae, "tiny": tiny})
+register = REGISTRY.register

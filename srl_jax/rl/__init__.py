@@ -8,13 +8,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.losses import categorical_q_learning, categorical_target, entropy, huber, q_learning
 from srl_jax.rl.losses import n_step as n_step_view
 from srl_jax.specs import check_size, choices_text
 from srl_jax.types import Context, Latents, Objective, Window
 
-__all__ = ["REGISTRY", "Algorithm", "normal_logits", "rainbow"]
+__all__ = ["REGISTRY", "register", "Algorithm", "normal_logits", "rainbow"]
 
 
 PRIORITIES = ("cross_entropy", "kl")
@@ -192,9 +193,13 @@ def normal_logits(atoms: np.ndarray, std: float) -> tuple[float, ...]:
 
 
 _plain = partial(rainbow, double=False, dueling=False, noisy=False, prioritized=False, n_step=1)
-REGISTRY = {
-    "rainbow": rainbow,
-    "c51": _plain,
-    "double": partial(_plain, distributional=False, double=True),
-    "dqn": partial(_plain, distributional=False),
-}
+REGISTRY = Registry(
+    "rl",
+    {
+        "rainbow": rainbow,
+        "c51": _plain,
+        "double": partial(_plain, distributional=False, double=True),
+        "dqn": partial(_plain, distributional=False),
+    },
+)
+register = REGISTRY.register
