@@ -109,7 +109,7 @@ def evaluated(
             continue
         found = {name: [steps_and_returns(run) for run in arm] for name, arm in members.items()}
         until = min(int(steps[-1]) for arm in found.values() for steps, _ in arm)
-        ends = {name: _ends(arm, until) for name, arm in found.items()}
+        ends = {name: collect.ends(arm, until) for name, arm in found.items()}
         entry: dict[str, Any] = {"equal_until": until, "arms": {}}
         for name, arm in found.items():
             values = {"seeds": [run.seed for run in members[name]]} | _curve(arm)
@@ -136,17 +136,8 @@ def _curve(arm: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
     return {"env_steps": grid.tolist(), **_limits(interval), "runs": _plain(returns)}
 
 
-def _ends(arm: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str, np.ndarray]:
-    """What arms are compared by, float64 [runs] each: up to an env step that all of them have."""
-    grid, returns = statistics.at_equal_steps(arm)
-    return {
-        "area_under_curve": statistics.area_under_curve(grid, returns, until),
-        "at_the_end": np.array([np.interp(until, grid, one) for one in returns]),
-    }
-
-
 def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """An arm's `_ends` against the baseline's."""
+    """An arm's `collect.ends` against the baseline's."""
     found = {}
     for of in ours:
         difference = statistics.estimate_difference({game: ours[of]}, {game: base[of]})

@@ -111,7 +111,7 @@ def given_flags(values: flags.FlagValues) -> dict[str, str | tuple[str, ...]]:
     """
     names = [info.flag or name for name, info in INFOS.items()]
     found: dict[str, str | tuple[str, ...]] = {}
-    for name in (*names, *config_flags.RL_OPTIONS, "preset", "tune_runtime"):
+    for name in (*names, "preset", "config", "tune_runtime"):
         if not values[name].present:
             continue
         if name in plan.OWN:

@@ -151,6 +151,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     """
     config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
     if values["print_config"].value:
+        config_flags.say_what_is_replaced(values)
         display.result(resolved(config).to_json())
         return 0
     seeds = check_seeds(values)
@@ -178,6 +179,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
     check_paths(needed)
     checkpoint.check_sources(needed)
+    config_flags.say_what_is_replaced(values)
     if not resume and not values["overwrite"].value:
         for directory, _ in runs:
             say_anew(directory)

@@ -365,11 +365,11 @@ class Run:
 
     @property
     def hyper(self) -> Hyper:
-        """The numbers of the next update: the agent's, with learning rates on their way to `lr_final`."""
+        """Numbers of the next update: the agent's, with learning rates on their way to `lr_final_share`."""
         hyper = self.agent.hyper
-        if self.config.lr_final == 1.0:
+        if self.config.lr_final_share == 1.0:
             return hyper
-        left = linear(1.0, self.config.lr_final, self.config.steps, self.env_steps)
+        left = linear(1.0, self.config.lr_final_share, self.config.steps, self.env_steps)
         return hyper._replace(
             learning_rates={name: np.float32(rate * left) for name, rate in self.learning_rates.items()}
         )

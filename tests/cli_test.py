@@ -123,17 +123,55 @@ def test_flags_override_a_preset_even_where_they_give_the_default():
     assert _config(preset, "--mode=rl_only", "--objective=none").objectives == ()
 
 
-def test_short_flags_stand_for_options_of_rl():
-    assert _config("--n_step=5", "--num_atoms=21").rl == "rainbow:n_step=5,atoms=21"
-    assert _config("--rl=dqn:double=true", "--alpha=1").rl == "dqn:double=true,alpha=1.0"
-    assert _config("--rl=rainbow:v_min=-1", "--v_min=-1.0").rl == "rainbow:v_min=-1"
-    assert _config("--preset=catch/rl_only", "--noisy_std=0.5").rl == (
-        "rainbow:v_min=-2,v_max=2,hidden=128,noisy_std=0.5"
+def test_a_colon_in_front_changes_options_and_keeps_the_rest():
+    assert _config("--rl=:n_step=5,atoms=21").rl == "rainbow:n_step=5,atoms=21"
+    preset = "--preset=catch/rl_only"
+    assert _config(preset, "--rl=:noisy_std=0.5,v_max=3").rl == (
+        "rainbow:v_min=-2,v_max=3,hidden=128,noisy_std=0.5"
     )
-    # A preset's option is overridden like the rest of it; a typed one contradicts.
-    assert config_flags.with_rl_options("c51:n_step=1", {"n_step": 3}, False) == "c51:n_step=3"
-    with pytest.raises(ConfigError, match="--n_step=3: contradicts --rl=c51:n_step=1"):
-        _config("--rl=c51:n_step=1", "--n_step=3")
+    assert _config(preset, "--rl=dqn").rl == "dqn"
+    assert _config("--preset=thesis/rl_only_256", "--encoder=:features=9").encoder.startswith(
+        "sac_ae:features=9,init=he,"
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "left"),
+    [
+        (["inverse"], ["inverse"]),
+        (["+inverse:weight=2"], ["reconstruction:weight=1", "latent_l2:weight=1e-6", "inverse:weight=2"]),
+        (["-latent_l2"], ["reconstruction:weight=1"]),
+        (["+reconstruction:weight=3"], ["reconstruction:weight=3", "latent_l2:weight=1e-6"]),
+        (["-reconstruction", "+inverse"], ["latent_l2:weight=1e-6", "inverse"]),
+    ],
+)
+def test_objectives_replace_or_with_a_sign_add_and_leave_out(given, left):
+    flags = [f"--objective={text}" for text in given]
+    assert _config("--preset=catch/joint", *flags).objectives == tuple(left)
+
+
+def test_it_is_said_which_objectives_are_replaced(capsys, loop, tmp_path):
+    _train("--preset=catch/joint", "--objective=inverse", f"--out={tmp_path}/a")
+    assert (
+        "objective: inverse in place of reconstruction:weight=1 and latent_l2:weight=1e-6 of "
+        "--preset=catch/joint; --objective=+NAME adds to them\n"
+    ) in capsys.readouterr().err
+    _train("--preset=catch/joint", "--objective=+inverse", f"--out={tmp_path}/b")
+    _train("--game=Catch", "--mode=joint", "--objective=inverse", f"--out={tmp_path}/c")
+    assert "objective" not in capsys.readouterr().err
+
+
+def test_settings_come_from_a_config_file(tmp_path, loop):
+    out = tmp_path / "run"
+    _train("--preset=catch/joint", "--seed=3", "--lr_rl=1e-3", f"--out={out}")
+    ((first, _),) = loop.calls
+    for given in (out, out / "config.json"):
+        assert train.resolved(_config(f"--config={given}")) == first
+    # What followed from another value follows it again.
+    config = train.resolved(_config(f"--config={out}", "--lr_rl=5e-3", "--eval_every=500", "--seed=4"))
+    assert (config.lr_encoder, config.checkpoint_every, config.seed) == (5e-3, 500, 4)
+    assert config.objectives == first.objectives
+    assert _config(f"--config={out}", "--objective=+inverse").objectives[-1] == "inverse"
 
 
 BAD = [
@@ -163,7 +201,20 @@ BAD = [
     (["--steps", "abc"], "--steps=abc", "not a whole number"),
     (["--lr_rl=nan"], "--lr_rl=nan", "finite"),
     (["--gamma=1.5"], "--gamma=1.5", "at most 1"),
-    (["--n_step=0"], "--n_step=0", "at least 1"),
+    (["--n_step=3"], "--n_step", "is now --rl=:n_step=..."),
+    (["--num_atoms=3"], "--num_atoms", "is now --rl=:atoms=..."),
+    (["--lr_final=0.1"], "--lr_final", "is now --lr_final_share=..."),
+    (["--rl=:n_step=0"], "--rl=rainbow:n_step=0", "at least 1"),
+    (["--rl=:n_step"], "--rl=:n_step", "'n_step' is not key=value"),
+    (["--encoder=:n_step=1"], "--encoder=nature:n_step=1", "nature has no option"),
+    (["--preset=small"], "--preset=small", "thesis/joint_256+small"),
+    (["--preset=thesis/joint_256+smal"], "--preset=thesis/joint_256+smal", "did you mean small?"),
+    (["--preset=catch/joint", "--config=x"], "--config=x", "--preset=catch/joint; give one of them"),
+    (["--config=no/such"], "--config=no/such", "give a run's config.json"),
+    (["--config=pyproject.toml"], "--config=pyproject.toml", "not JSON"),
+    ([*JOINT, "--objective=+inverse"], "--objective=reconstruction", "replaces all"),
+    (["--preset=catch/joint", "--objective=-inverse"], "--objective=-inverse", "reconstruction, latent_l2"),
+    (["--import=no_such.py"], "--import=", "no such file"),
     (["--reward_clip=maybe"], "--reward_clip=maybe", "true or false"),
     (["--srl_every=4"], "--srl_every=4", "joint, decoupled"),
     (["--srl_every=0", *JOINT], "--srl_every=0", "at least 1"),
@@ -356,11 +407,11 @@ def test_a_start_that_failed_is_in_nobodys_way(capsys, loop, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(loop, "train", failed)
         with pytest.raises(RuntimeError):
-            _train(*CATCH, "--n_step=7", f"--out={out}")
+            _train(*CATCH, "--rl=:n_step=7", f"--out={out}")
     assert (out / "config.json").exists()
     capsys.readouterr()
     for arguments in ([], ["--resume=auto"]):
-        assert _train(*CATCH, "--n_step=6", f"--out={out}", *arguments) == 0
+        assert _train(*CATCH, "--rl=:n_step=6", f"--out={out}", *arguments) == 0
         assert "n_step=6" in Config.load(out).rl
         assert capsys.readouterr().err == (f"resume: {out}: no checkpoint there yet; the run begins again\n")
 

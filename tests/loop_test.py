@@ -472,7 +472,7 @@ def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
 
 def test_updates_are_compiled_once(joint):
     del joint
-    run = loop.Run(Config(**SMALL, lr_final=0.5), None, False)
+    run = loop.Run(Config(**SMALL, lr_final_share=0.5), None, False)
     from srl_jax.replay import Window  # the type that replay gives
 
     run.replay.begin(run.env.reset()[0])
@@ -509,11 +509,11 @@ def test_learning_rates_fall_linearly_to_the_share_that_is_left():
         return loop.Run.hyper.fget(run)
 
     assert at(150) is hyper  # by default they stay as they are
-    assert at(0, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 4e-3})
-    assert at(150, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 1.6e-3})
-    assert at(200, lr_final=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 0.8e-3})
-    assert at(150, lr_final=0.2).weights == hyper.weights
-    assert all(rate.dtype == np.float32 for rate in at(150, lr_final=0.2).learning_rates.values())
+    assert at(0, lr_final_share=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 4e-3})
+    assert at(150, lr_final_share=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 1.6e-3})
+    assert at(200, lr_final_share=0.2).learning_rates == pytest.approx({"encoder": 0.0, "rl": 0.8e-3})
+    assert at(150, lr_final_share=0.2).weights == hyper.weights
+    assert all(rate.dtype == np.float32 for rate in at(150, lr_final_share=0.2).learning_rates.values())
 
 
 def started(tmp_path, **values):

@@ -294,13 +294,13 @@ def test_command_lines_that_are_refused(tmp_path, arguments, says):
 
 
 def test_flags_of_training_go_to_every_run(tmp_path):
-    given = ("--steps=1e3", "--objective=inverse", "--nolife_loss", "--stop_at_return=off", "--n_step=2")
+    given = ("--steps=1e3", "--objective=inverse", "--nolife_loss", "--stop_at_return=off", "--rl=:n_step=2")
     values, root = _main(f"--out={tmp_path}", "--presets=small/joint_*", "--games=Catch", "--seeds=2", *given)
     runs = sweep.chosen_runs(values, root)
     assert runs[0].name == "Catch/joint_256/seed0"
     assert runs[0].flags == {
         "game": "Catch", "seed": "0", "objective": ("inverse",), "steps": "1000", "stop_at_return": "off",
-        "life_loss": "false", "n_step": "2",
+        "life_loss": "false", "rl": ":n_step=2",
     }  # fmt: skip
     with pytest.raises(ConfigError, match="--gpus_per_run: only --launcher=ray"):
         sweep.launcher_options(_main(f"--out={tmp_path}", "--gpus_per_run=1")[0])

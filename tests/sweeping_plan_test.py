@@ -89,7 +89,7 @@ def test_a_command_line_is_the_runs_own():
 
 
 def test_configurations_are_those_that_training_writes():
-    flags = {"encoder": "tiny:features=8", "objective": ("forward_pixels", "latent_l2"), "n_step": "2"}
+    flags = {"encoder": "tiny:features=8", "objective": ("forward_pixels", "latent_l2"), "rl": ":n_step=2"}
     (run,) = plan.plan([Arm("a", "small/joint_256", flags)], ["CatchDistractor"], [4], {"steps": "500"})
     (config,) = resolving.resolve_here([run]).values()
     assert (config.game, config.seed, config.steps) == ("CatchDistractor", 4, 500)
@@ -101,7 +101,10 @@ def test_configurations_are_those_that_training_writes():
 @pytest.mark.parametrize(
     "arm, says",
     [
-        (Arm("a", "small/joint_256", {"stepz": "3"}), "Catch/a/seed0: Unknown command line flag 'stepz'"),
+        (
+            Arm("a", "small/joint_256", {"stepz": "3"}),
+            "Catch/a/seed0: --stepz: no such flag; did you mean --steps",
+        ),
         (Arm("a", "small/joint_256", {"steps": "0"}), "Catch/a/seed0: --steps=0: must be at least 1"),
         (Arm("a", "small/rl_only_256", {"objective": ("x",)}), "runs no representation loss"),
         (Arm("a", "small/joint_256", {"objective": ("x",)}), "Catch/a/seed0: --objective=x"),

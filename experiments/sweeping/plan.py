@@ -13,7 +13,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
 
 from .. import PACKAGE
-from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS
+from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, parts, preset_values, source_preset
 
 Flags = Mapping[str, str | tuple[str, ...]]
 """Flags of experiments.train as typed on the command line; a tuple's is repeated."""
@@ -28,6 +28,7 @@ OWN = {
     "game": "games",
     "seed": "seeds",
     "preset": "presets",
+    "config": "presets",
     "encoder_from": "presets",
     "policy_from": "presets",
 }
@@ -39,7 +40,7 @@ class Arm(NamedTuple):
 
     Attributes:
         name: of its runs' directories.
-        preset: a key of `experiments.presets.PRESETS`.
+        preset: as of `experiments.presets.preset_values`.
         flags: over the preset, for this arm alone.
     """
 
@@ -53,7 +54,7 @@ class Planned(NamedTuple):
 
     Attributes:
         name: GAME/ARM/seedN, also its directory under the sweep's root.
-        preset: a key of `experiments.presets.PRESETS`.
+        preset: as of `experiments.presets.preset_values`.
         flags: over the preset.
         encoder_from, policy_from: names of the runs that it starts from, or "".
     """
@@ -71,8 +72,8 @@ class Planned(NamedTuple):
 
 
 def arm_of(preset: str) -> Arm:
-    """The arm of a preset, with its name less its family's."""
-    return Arm(preset.rpartition("/")[2], preset)
+    """The arm of a preset, with its name less its family's: thesis/joint_256+small is joint_256_small."""
+    return Arm("_".join(part.rpartition("/")[2] for part in preset.split("+")), preset)
 
 
 def plan(
@@ -112,15 +113,16 @@ def plan(
     runs: dict[str, Planned] = {}
 
     def add(arm: Arm, game: str, seed: int) -> str:
-        mode = arm.flags.get("mode", flags.get("mode", PRESETS[arm.preset]["mode"]))
+        mode = arm.flags.get("mode", flags.get("mode", preset_values(arm.preset)["mode"]))
         own = {**flags, **arm.flags}
         if mode == "pretrain" and "steps" in flags and "steps" not in arm.flags:
             own["steps"] = _pretraining(flags["steps"])
         sources = {}
         for flag, table in SOURCES.items():
             # A preset's source is asked for while its mode is, as on the command line of a single run.
-            if arm.preset in table and mode == PRESETS[arm.preset]["mode"]:
-                source = arm_of(table[arm.preset])
+            preset = source_preset(arm.preset, table)
+            if preset and mode == preset_values(arm.preset.partition("+")[0])["mode"]:
+                source = arm_of(preset)
                 named = by_name.get(source.name, source)
                 if named.preset != source.preset:
                     raise ConfigError(
@@ -134,14 +136,16 @@ def plan(
 
     for seed in seeds:
         for arm in by_name.values():
-            for game in games or [PRESETS[arm.preset]["game"]]:
+            for game in games or [preset_values(arm.preset)["game"]]:
                 add(arm, game, seed)
     return list(runs.values())
 
 
 def _check(arm: Arm) -> None:
-    if arm.preset not in PRESETS:
-        raise ConfigError(f"arm {arm.name}: {arm.preset}: {choices_text(arm.preset, PRESETS)}")
+    try:
+        parts(arm.preset)
+    except ConfigError as error:
+        raise ConfigError(f"arm {arm.name}: {error}") from None
     plain = arm.name.replace("_", "").replace("-", "").replace(".", "").replace("=", "")
     if not (plain.isascii() and plain.isalnum()) or arm.name.startswith("."):
         raise ConfigError(f"arm {arm.name}: a name is made of letters, digits and _ - . =")
@@ -169,15 +173,19 @@ def _pretraining(steps: str | tuple[str, ...]) -> str:
 
 
 def presets(patterns: Sequence[str]) -> list[str]:
-    """The presets that match any of the patterns, as in thesis/*, in the order of the table.
+    """The presets that match the patterns, as in thesis/* or thesis/*+small, in the order of the table.
 
     Raises:
         ConfigError: a pattern matches none.
     """
-    for pattern in patterns:
-        if not fnmatch.filter(PRESETS, pattern):
-            raise ConfigError(f"--presets={pattern}: {choices_text(pattern, PRESETS)}")
-    return [name for name in PRESETS if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
+    found: dict[str, list[str]] = {}
+    for text in patterns:
+        pattern, plus, pieces = text.partition("+")
+        matching = fnmatch.filter(PRESETS, pattern)
+        if not matching:
+            raise ConfigError(f"--presets={text}: {choices_text(pattern, PRESETS)}")
+        found.setdefault(plus + pieces, []).extend(matching)
+    return [name + pieces for pieces, names in found.items() for name in PRESETS if name in names]
 
 
 def parse_seeds(text: str, flag: str = "seeds") -> list[int]:

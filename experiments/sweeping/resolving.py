@@ -90,6 +90,8 @@ def parsed(run: Planned) -> Config:
     sources = [f"--{f}={getattr(run, f)}" for f in ("encoder_from", "policy_from") if getattr(run, f)]
     try:
         values([run.name, *settings(run), *sources])
+    except flags.UnrecognizedFlagError as error:
+        raise ConfigError(f"--{error.flagname}: {config_flags.unknown(error.flagname, values)}") from None
     except (flags.Error, ValueError) as error:
         raise ConfigError(str(error).removeprefix("flag ")) from None
     return config_flags.config_from_flags(values)
