@@ -269,6 +269,7 @@ def run(values: flags.FlagValues) -> int:
     options = sweep.launcher_options(values)
     seeds, games = parse_seeds(values["seeds"].value), list(dict.fromkeys(values["games"].value))
     runs = planned(figures, games, seeds, sweep.given_flags(values))
+    sweep.say_what_is_replaced(values, runs)
     methods = _known(values["published"].value)
     if values["dry_run"].value:
         display.result("\n".join(sweep.dry_run(root, runs, **options)))

@@ -19,6 +19,7 @@ from srl_jax.errors import EXIT_STATUS, ConfigError
 from srl_jax.reading import SETTINGS, read_bytes
 from srl_jax.specs import Info
 
+from . import help
 from .presets import ENCODER_PRESETS, preset_values, source_preset
 
 # The flags count as the entry point's own, so that --help shows them.
@@ -291,18 +292,23 @@ def fail(message: Any, status: int = 2) -> NoReturn:
 
 
 def parse(
-    argv: list[str], values: flags.FlagValues = flags.FLAGS, positional: str | None = None
+    argv: list[str],
+    values: flags.FlagValues = flags.FLAGS,
+    positional: str | None = None,
+    about: str = "",
 ) -> list[str]:
-    """Parses a command line; exits with one line and status 2 where it is not valid.
+    """Parses a command line; exits with one line and status 2 where it is not valid, with 0 after --help.
 
     Args:
         argv: the program's name and its arguments.
         values: where the flags are defined.
         positional: a flag whose value, or values, may be given without its name; None for none.
+        about: what the program does, for --help.
 
     Returns:
         [the program's name].
     """
+    help.if_asked(argv, about, values)
     # absl would wait for a pipe there, read a device without end, and end in tracebacks.
     if any(argument.lstrip("-").partition("=")[0] == "flagfile" for argument in argv[1:]):
         fail("--flagfile: not taken; write the flags themselves, or use --preset")
@@ -359,10 +365,12 @@ def run(main: Callable[[list[str]], Any], positional: str | None = None) -> None
     """Runs an entry point: parses the flags, and ends with a line and a status where it fails; see `guarded`.
 
     Args:
-        main: takes [the program's name]; may return the exit status.
+        main: takes [the program's name]; may return the exit status. Its module's docstring begins --help.
         positional: see `parse`.
     """
     # absl prints what libraries log, and jax logs every accelerator that it does not find.
     logging.getLogger("jax").setLevel(logging.WARNING)
     display.secure()
-    app.run(guarded(main), flags_parser=functools.partial(parse, positional=positional))
+    function = main.func if isinstance(main, functools.partial) else main
+    about = sys.modules[function.__module__].__doc__ or ""
+    app.run(guarded(main), flags_parser=functools.partial(parse, positional=positional, about=about))

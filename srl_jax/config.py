@@ -66,10 +66,18 @@ class Config:
         str, "rl_only", "; ".join(f"{m.name}: {m.help}" for m in modes.MODES.values()),
         choices=tuple(modes.MODES),
     )  # fmt: skip
-    rl: str = _value(str, "rainbow", "RL algorithm, name:key=value,...")
-    encoder: str = _value(str, "nature", "encoder that all losses share, name:key=value,...")
+    rl: str = _value(
+        str, "rainbow", "RL algorithm, name:key=value,...; :key=value,... changes options of the preset's"
+    )
+    encoder: str = _value(
+        str,
+        "nature",
+        "encoder that all losses share, name:key=value,...; :key=value,... changes the preset's",
+    )
     objectives: tuple[str, ...] = _value(
-        tuple, (), "representation loss, name:key=value,...; may be repeated; none for none",
+        tuple, (),
+        "representation loss, name:key=value,...; may be repeated; none for none; beside a preset, +name:... "
+        "adds one to its own, or replaces the one of that name, and -name leaves one out",
         flag="objective",
     )  # fmt: skip
     augment: str = _value(

@@ -15,7 +15,7 @@ from absl import flags
 
 import srl_jax
 from experiments import flags as config_flags
-from experiments import train
+from experiments import resume, train
 from experiments.presets import PRESETS
 from srl_jax import checkpoint, rundir
 from srl_jax.config import INFOS, Config
@@ -553,6 +553,38 @@ def test_errors_are_one_line_and_have_a_status_of_their_own(error, status):
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "error: two lines\n")
 
 
+def test_resume_needs_nothing_but_the_directory(loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    _train(*CATCH, "--lr_rl=1e-3", "--objective=inverse", "--mode=joint", f"--out={out}")
+    manifest = _checkpoint(out, 100)
+    _train(*resume.command_line(str(out)))
+    (_, (config, path)) = loop.calls
+    assert (config, path) == (Config.load(out), out)
+    assert loop.resumed[-1].path == checkpoint.read_manifest(out).path and manifest
+
+
+def test_resume_finds_the_seeds_of_a_process(loop, tmp_path):
+    for seed in (10, 2):
+        _train(*CATCH, f"--seed={seed}", f"--out={tmp_path}/runs/seed{seed}")
+    assert resume.command_line(f"{tmp_path}/runs") == [
+        f"--config={tmp_path}/runs/seed2/config.json", "--seeds=2,10", f"--out={tmp_path}/runs",
+        "--resume=auto",
+    ]  # fmt: skip
+
+
+def test_resume_refuses_what_is_no_run(tmp_path):
+    with pytest.raises(ConfigError, match="not a run directory"):
+        resume.command_line(str(tmp_path))
+    (tmp_path / "sweep.json").touch()
+    with pytest.raises(ConfigError, match="a sweep, with which srl-jax sweep --out="):
+        resume.command_line(str(tmp_path))
+    done = _python("-m", "experiments.resume")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "error: name a run directory first: srl-jax resume runs/NAME\n",
+    )
+
+
 SHORT = SMALL | {"steps": 1200, "eval_every": 400}
 RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=off"]
 
@@ -579,7 +611,7 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
     line = f"stopped after {stopped} env steps; --resume=auto goes on from there, in {out}"
     assert line in printed.splitlines()
 
-    done = _python("-m", "experiments.train", *RUN, f"--out={out}", "--resume=auto")
+    done = _python("-m", "srl_jax", "resume", str(out), "--tune_runtime=off")
     assert done.returncode == 0, done.stderr
     assert f"1200 env steps, 145 updates; everything is in {out}" in done.stdout
     whole = tmp_path / "whole"
@@ -667,11 +699,6 @@ def test_the_entry_point_prints_its_config():
     done = _python("-m", "experiments.train", "--preset=thesis/joint_256", "--print_config")
     assert (done.returncode, done.stderr) == (0, "")
     assert Config.from_json(done.stdout).encoder.startswith("sac_ae:features=256,")
-
-
-def test_help_lists_the_flags():
-    done = _python("-m", "experiments.train", "--help")
-    assert "--steps: length of the run [env steps]" in done.stdout
 
 
 def test_nothing_that_is_checked_first_imports_jax():

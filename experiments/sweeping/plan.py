@@ -1,7 +1,9 @@
 """What a sweep runs: a run for each arm, game and seed, and what these start from. Imports no jax."""
 
 import fnmatch
+import itertools
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -13,6 +15,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
 
 from .. import PACKAGE
+from ..flags import unknown
 from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, parts, preset_values, source_preset
 
 Flags = Mapping[str, str | tuple[str, ...]]
@@ -74,6 +77,38 @@ class Planned(NamedTuple):
 def arm_of(preset: str) -> Arm:
     """The arm of a preset, with its name less its family's: thesis/joint_256+small is joint_256_small."""
     return Arm("_".join(part.rpartition("/")[2] for part in preset.split("+")), preset)
+
+
+def grid(arms: Sequence[Arm], texts: Sequence[str], flags: Flags) -> list[Arm]:
+    """The arms, each once with every combination of values.
+
+    Args:
+        arms: to vary.
+        texts: FLAG=VALUE,VALUE,... each; with ; between them values may have commas.
+        flags: for every run, given beside.
+
+    Raises:
+        ConfigError: one is not that, or no flag of training, or the flag is there already.
+    """
+    known = [info.flag or name for name, info in INFOS.items()]
+    axes: dict[str, list[str]] = {}
+    for text in texts:
+        flag, _, rest = text.partition("=")
+        values = [value.strip() for value in rest.split(";" if ";" in rest else ",")]
+        if not all((flag, *values)):
+            raise ConfigError(f"--grid={text}: must be FLAG=VALUE,VALUE, as in --grid=lr_rl=1e-4,3e-4")
+        if flag not in known:
+            raise ConfigError(f"--grid={text}: --{flag}: {unknown(flag, known)}")
+        if flag in axes or flag in flags:
+            raise ConfigError(f"--grid={text}: --{flag} is given beside it; give it once")
+        axes[flag] = values
+    found = []
+    for arm in arms:
+        for combination in itertools.product(*axes.values()):
+            own = dict(zip(axes, combination, strict=True))
+            parts = (f"{flag}={re.sub(r'[^A-Za-z0-9_.=-]+', '-', x.lstrip(':+'))}" for flag, x in own.items())
+            found.append(Arm("_".join((arm.name, *parts)), arm.preset, {**arm.flags, **own}))
+    return found
 
 
 def plan(
