@@ -14,14 +14,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.flags import RL_OPTIONS
-from experiments.presets import PRESETS
 from srl_jax.config import INFOS
 from srl_jax.data import thesis_curve
 from srl_jax.envs import CATCH
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text, near
+
+from .flags import MOVED
+from .presets import parts
 
 
 class FigureArm(NamedTuple):
@@ -179,8 +180,10 @@ def read_figure(path: Path) -> Figure:
     kinds = {"name": str, "preset": str, "flags": dict, "thesis": str}
     for number, arm in enumerate(values["arms"], 1):
         arm = check(arm, kinds, ("name", "preset"), f"arm {number}")
-        if arm["preset"] not in PRESETS:
-            raise refuse(f"arm {number}: no preset {arm['preset']!r}; {choices_text(arm['preset'], PRESETS)}")
+        try:
+            parts(arm["preset"])
+        except ConfigError as error:
+            raise refuse(f"arm {number}: no preset {error}") from None
         flags = {
             flag: _flag_text(refuse, number, flag, value) for flag, value in arm.get("flags", {}).items()
         }
@@ -197,11 +200,13 @@ def read_figure(path: Path) -> Figure:
 
 
 def _flag_text(refuse: Any, number: int, flag: str, value: Any) -> str | tuple[str, ...]:
-    known = {info.flag or name for name, info in INFOS.items()} | RL_OPTIONS.keys()
+    known = {info.flag or name for name, info in INFOS.items()}
+    if flag in MOVED:
+        raise refuse(f"arm {number}: --{flag} is now {MOVED[flag]}")
     if flag not in known:
         close = near(flag, known)
         meant = f"did you mean {' or '.join(close)}? " if close else ""
-        raise refuse(f"arm {number}: no flag {flag!r}; {meant}python -m experiments.train --help lists them")
+        raise refuse(f"arm {number}: no flag {flag!r}; {meant}srl-jax train --help lists them")
     if isinstance(value, list) and all(isinstance(element, str) for element in value):
         return tuple(value)
     if isinstance(value, bool):

@@ -12,18 +12,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments.directories import natural, runs_below
-from experiments.draw import read_rows
-from srl_jax import ending
+from srl_jax import ending, statistics
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 
+from .directories import natural, runs_below
+from .draw import read_rows
+
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
-OF_A_SEED = ("seed", "encoder_from", "policy_from")
+OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports")
 """Fields in which runs of one arm and game may differ."""
 
 
@@ -119,6 +120,20 @@ def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
     rows = [row for row in run.rows if row["kind"] == "eval" and row.get("eval/return_mean") is not None]
     steps = np.array([row["env_steps"] for row in rows], np.int64)
     return steps, np.array([row["eval/return_mean"] for row in rows], np.float64)
+
+
+def ends(curves: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str, np.ndarray]:
+    """What arms are compared by, float64 [runs] each: up to an env step that all of them have.
+
+    Args:
+        curves: of an arm's runs, as of `steps_and_returns`.
+        until: that env step.
+    """
+    grid, returns = statistics.at_equal_steps(curves)
+    return {
+        "area_under_curve": statistics.area_under_curve(grid, returns, until),
+        "at_the_end": np.array([np.interp(until, grid, one) for one in returns]),
+    }
 
 
 def has_policy(run: RunData) -> bool:

@@ -9,8 +9,8 @@ import functools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from experiments.arms import FIGURES
-from experiments.plots import COLOURS
+from .arms import FIGURES
+from .plots import COLOURS
 
 LINES = ("-", "--", ":")
 """Of arms that have the same colour."""

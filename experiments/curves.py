@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import plots
-from experiments.colours import Style, styles
+from . import plots
+from .colours import Style, styles
 
 
 class Line(NamedTuple):

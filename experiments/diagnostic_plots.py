@@ -7,8 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.plots import COLOURS, count_axis, log_axis, new_figure, save, steps_label
 from srl_jax.diagnostics import rows as of_rows
+
+from .plots import COLOURS, count_axis, log_axis, new_figure, save, steps_label
 
 WRITTEN_IN = 11
 """Epochs up to which a matrix has its numbers written in."""

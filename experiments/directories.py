@@ -7,13 +7,14 @@ import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
-from experiments import flags as config_flags
 from srl_jax import checkpoint, display, ending, rundir
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import PARTIAL, SOURCES, Config, another_run, changes, record_changes
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import read_metrics
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
+
+from . import flags as config_flags
 
 
 def say(line: str) -> None:

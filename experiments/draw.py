@@ -11,14 +11,15 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import diagnostic_plots, plots
-from experiments import flags as config_flags
 from srl_jax.config import Config
 from srl_jax.data import reference_policies, thesis_curve
 from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import KINDS, read_metrics
 from srl_jax.specs import LIMITS
+
+from . import diagnostic_plots, plots
+from . import flags as config_flags
 
 FLAGS = flags.FLAGS
 
@@ -144,7 +145,12 @@ def main(argv: list[str]) -> None:
         print(path)
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     flags.DEFINE_string("run", "", "run directory")
     flags.DEFINE_string("thesis", "", "FIGURE/ARM, a curve of the thesis to draw beside the run's")
-    config_flags.run(main)
+    config_flags.run(main, positional="run")
+
+
+if __name__ == "__main__":
+    cli()

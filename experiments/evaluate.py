@@ -10,11 +10,12 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import runtime
-from srl_jax import display
+from srl_jax import display, plugins
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
+
+from . import flags as config_flags
+from . import runtime
 
 FLAGS = flags.FLAGS
 
@@ -25,7 +26,7 @@ def check_gif(path: str) -> None:
     Raises:
         ConfigError: it cannot, or there is one already.
     """
-    from experiments import plots
+    from . import plots
 
     if not plots.available():
         raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
@@ -73,6 +74,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     from srl_jax import actor, loading
     from srl_jax.evaluate import evaluate
 
+    plugins.load(map(plugins.located, FLAGS["import"].value or config.imports))
     agent, params, manifest = loading.load_agent(FLAGS.run)
     number = min(FLAGS.games, config.num_envs)
     env = actor.make_env(config, "eval", number, seed=FLAGS.seed)
@@ -101,19 +103,26 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         "lengths": played.lengths,
     }
     if FLAGS.gif:
-        from experiments import plots
+        from . import plots
 
         plots.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
     display.result(json.dumps(result))
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     flags.DEFINE_string("run", "", "run directory, or one of its checkpoints")
     config_flags.define("games", Info(int, "full games to play", minimum=1, maximum=1_000_000), 10)
     seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
     config_flags.define("seed", seed, 0)
     epsilon = "probability of a random action; the run's eps_eval if not given"
     config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None)
+    imports = "what to import in place of what the run's config.json names; may be repeated"
+    flags.DEFINE_multi_string("import", None, imports)
     flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF")
     config_flags.define_runtime_flag()
-    config_flags.run(functools.partial(main, prepare=runtime.prepare))
+    config_flags.run(functools.partial(main, prepare=runtime.prepare), positional="run")
+
+
+if __name__ == "__main__":
+    cli()

@@ -18,18 +18,19 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import collect, curves, plots, sweep
-from experiments import flags as config_flags
-from experiments.arms import FIGURES, Figure, figures_named
-from experiments.collect import RunData, comparable, steps_and_returns
-from experiments.colours import styles
-from experiments.sweeping.plan import Arm, Planned, parse_seeds, plan
 from srl_jax import display, statistics
 from srl_jax.config import Config
 from srl_jax.data import published, reference_policies
 from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
+
+from . import collect, curves, plots, sweep
+from . import flags as config_flags
+from .arms import FIGURES, Figure, figures_named
+from .collect import RunData, comparable, steps_and_returns
+from .colours import styles
+from .sweeping.plan import Arm, Planned, parse_seeds, plan
 
 FLAGS = flags.FLAGS
 
@@ -108,7 +109,7 @@ def evaluated(
             continue
         found = {name: [steps_and_returns(run) for run in arm] for name, arm in members.items()}
         until = min(int(steps[-1]) for arm in found.values() for steps, _ in arm)
-        ends = {name: _ends(arm, until) for name, arm in found.items()}
+        ends = {name: collect.ends(arm, until) for name, arm in found.items()}
         entry: dict[str, Any] = {"equal_until": until, "arms": {}}
         for name, arm in found.items():
             values = {"seeds": [run.seed for run in members[name]]} | _curve(arm)
@@ -135,17 +136,8 @@ def _curve(arm: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
     return {"env_steps": grid.tolist(), **_limits(interval), "runs": _plain(returns)}
 
 
-def _ends(arm: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str, np.ndarray]:
-    """What arms are compared by, float64 [runs] each: up to an env step that all of them have."""
-    grid, returns = statistics.at_equal_steps(arm)
-    return {
-        "area_under_curve": statistics.area_under_curve(grid, returns, until),
-        "at_the_end": np.array([np.interp(until, grid, one) for one in returns]),
-    }
-
-
 def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """An arm's `_ends` against the baseline's."""
+    """An arm's `collect.ends` against the baseline's."""
     found = {}
     for of in ours:
         difference = statistics.estimate_difference({game: ours[of]}, {game: base[of]})
@@ -277,6 +269,7 @@ def run(values: flags.FlagValues) -> int:
     options = sweep.launcher_options(values)
     seeds, games = parse_seeds(values["seeds"].value), list(dict.fromkeys(values["games"].value))
     runs = planned(figures, games, seeds, sweep.given_flags(values))
+    sweep.say_what_is_replaced(values, runs)
     methods = _known(values["published"].value)
     if values["dry_run"].value:
         display.result("\n".join(sweep.dry_run(root, runs, **options)))
@@ -336,6 +329,11 @@ def main(argv: list[str]) -> int:
     return run(FLAGS)
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     define_flags()
     config_flags.run(main)
+
+
+if __name__ == "__main__":
+    cli()

@@ -7,17 +7,20 @@ import functools
 import logging
 import os
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any, NoReturn
 
 from absl import app, flags
 
-from experiments.presets import ENCODER_PRESETS, PRESETS, preset_values
-from srl_jax import display, modes, specs
-from srl_jax.config import INFOS, Config
+from srl_jax import display, modes, plugins, specs
+from srl_jax.config import INFOS, Config, unresolved
 from srl_jax.errors import EXIT_STATUS, ConfigError
+from srl_jax.reading import SETTINGS, read_bytes
 from srl_jax.specs import Info
+
+from . import help
+from .presets import ENCODER_PRESETS, preset_values, source_preset
 
 # The flags count as the entry point's own, so that --help shows them.
 flags.disclaim_key_flags()
@@ -25,49 +28,20 @@ flags.disclaim_key_flags()
 LONGEST = 4_000
 """Characters of an error that are shown."""
 
-RL_OPTIONS: dict[str, tuple[str, Info]] = {
-    "n_step": ("n_step", Info(int, "steps of the return", "env steps", minimum=1)),
-    "num_atoms": ("atoms", Info(int, "atoms of the value distribution", "atoms", minimum=2)),
-    "v_min": ("v_min", Info(float, "lowest atom", "discounted return")),
-    "v_max": ("v_max", Info(float, "highest atom", "discounted return")),
-    "noisy_std": ("noisy_std", Info(float, "noisy layers' initial noise", minimum=0)),
-    "alpha": ("alpha", Info(float, "priorities' exponent", "exponent", minimum=0)),
+MOVED = {
+    **{name: f"--rl=:{name}=..." for name in ("n_step", "v_min", "v_max", "noisy_std", "alpha")},
+    "num_atoms": "--rl=:atoms=...",
+    "lr_final": "--lr_final_share=...",
 }
-"""Flags that stand for an option of --rl: flag -> (option, Info). All of table 5.1 is a flag."""
+"""{flag that there was: how its value is given now}; `--rl=:KEY=...` leaves the other options as they are."""
 
 
-def with_rl_options(rl: str, given: Mapping[str, Any], explicit: bool) -> str:
-    """The --rl text with the values of `RL_OPTIONS`' flags merged into it.
-
-    Args:
-        rl: a specification.
-        given: flag -> value, for the flags that were given.
-        explicit: `rl` was typed beside those flags, so the two may not contradict each other;
-            otherwise (it came from a preset) the flags win.
-
-    Raises:
-        ConfigError: a contradiction, or `rl` is not the syntax.
-    """
-    if not given:
-        return rl
-    try:
-        name, options = specs.split(rl)
-    except specs.SpecError as error:
-        raise ConfigError(f"--rl={rl}: {error}") from None
-    for flag, value in given.items():
-        option, info = RL_OPTIONS[flag]
-        if explicit and option in options:
-            try:
-                same = specs.parse_value(options[option], info.kind) == value
-            except ValueError:
-                same = True  # Resolving --rl reports it, with the option's own type.
-            if not same:
-                raise ConfigError(
-                    f"--{flag}={specs.value_text(value)}: contradicts --rl={rl}; give one of them"
-                )
-        else:
-            options[option] = specs.value_text(value)
-    return specs.join(name, options)
+def unknown(name: str, known: Iterable[str]) -> str:
+    """What is said of a flag that there is not: what may have been meant, or where its value has gone to."""
+    if name in MOVED:
+        return f"is now {MOVED[name]}"
+    close = " or ".join(f"--{flag}" for flag in specs.near(name, known))
+    return f"no such flag; {f'did you mean {close}? ' if close else ''}--help lists them all"
 
 
 class _Parser(flags.ArgumentParser):
@@ -111,15 +85,19 @@ def define(
 
 
 def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
-    """Defines a flag for every field of Config, `RL_OPTIONS` and --preset."""
+    """Defines a flag for every field of Config, --preset and --config."""
     for name, info in INFOS.items():
         define(info.flag or name, info, getattr(Config(), name), values)
-    for name, (option, info) in RL_OPTIONS.items():
-        define(name, info, None, values, f"; short for --rl=NAME:{option}=..., and as --rl says")
     flags.DEFINE_string(
         "preset",
         None,
-        "named settings, which the flags given beside it override; one of: " + ", ".join(PRESETS),
+        "named settings, which the flags beside it override; thesis/joint_256+small changes one by another",
+        flag_values=values,
+    )
+    flags.DEFINE_string(
+        "config",
+        None,
+        "config.json of a run, or the run's directory: its settings, which the flags beside it override",
         flag_values=values,
     )
 
@@ -130,8 +108,87 @@ def define_runtime_flag(values: flags.FlagValues = flags.FLAGS) -> None:
     define("tune_runtime", Info(str, help_text, choices=("auto", "off")), "auto", values)
 
 
+def _base(values: flags.FlagValues, game: str | None) -> tuple[dict[str, Any], str]:
+    """The settings that flags override, and where they are from: --preset, --config, or neither.
+
+    Raises:
+        ConfigError: there is no such preset or file, or both were given.
+    """
+    preset, path = values["preset"].value, values["config"].value
+    if path is None:
+        try:
+            return ({}, "") if preset is None else (preset_values(preset, game), f"--preset={preset}")
+        except ConfigError as error:
+            raise ConfigError(f"--preset={error}") from None
+    if preset is not None:
+        raise ConfigError(f"--config={path}: given beside --preset={preset}; give one of them")
+    file = Path(os.path.expanduser(path))
+    try:
+        text = read_bytes(file / "config.json" if file.is_dir() else file, SETTINGS)
+        config = Config.from_json(text)
+    except OSError as error:
+        raise ConfigError(f"--config={path}: {error.strerror}; give a run's config.json") from None
+    except ConfigError as error:
+        raise ConfigError(f"--config={path}: {error}") from None
+    return {name: getattr(unresolved(config), name) for name in INFOS}, f"--config={path}"
+
+
+def with_objectives(base: Sequence[str], given: Sequence[str]) -> tuple[str, ...]:
+    """The objectives of --objective beside a preset's.
+
+    Args:
+        base: the preset's.
+        given: `+name:key=value,...` adds one, or replaces the one of its name; `-name` leaves one out; plain
+            ones replace all.
+
+    Raises:
+        ConfigError: plain ones are among those with a sign, or there is none to leave out.
+    """
+    signed = [text[:1] in ("+", "-") for text in given]
+    if not any(signed):
+        return tuple(given)
+    if not all(signed):
+        plain = given[signed.index(False)]
+        raise ConfigError(
+            f"--objective={plain}: replaces all, beside --objective={given[signed.index(True)]}"
+        )
+    found = {text.partition(":")[0].strip(): text for text in base}
+    for text in given:
+        name, sign = text[1:].partition(":")[0].strip(), text[0]
+        if sign == "+":
+            found[name] = text[1:]
+        elif name != text[1:].strip() or found.pop(name, None) is None:
+            raise ConfigError(f"--objective={text}: names none to leave out; there are: {', '.join(found)}")
+    return tuple(found.values())
+
+
+def replaced_objectives(given: Sequence[str], base: Sequence[str], whose: str) -> str:
+    """A line that says which objectives plain ones replace; "" where they replace none.
+
+    Args:
+        given: --objective's values.
+        base: what a preset or a config has.
+        whose: it is.
+    """
+    plain = [text for text in given if text[:1] not in ("+", "-")]
+    if not plain or not base or tuple(plain) in (("none",), ("",), tuple(base)):
+        return ""
+    hint = "; --objective=+NAME adds to them" if len(plain) == 1 else ""
+    return f"objective: {' and '.join(plain)} in place of {' and '.join(base)} of {whose}{hint}"
+
+
+def say_what_is_replaced(values: flags.FlagValues) -> None:
+    """Says in a line which objectives of --preset or --config are replaced."""
+    base, whose = _base(values, None)
+    if line := replaced_objectives(values["objective"].value or (), base.get("objectives", ()), whose):
+        display.say(line)
+
+
 def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool = True) -> Config:
-    """The settings that the command line asks for: defaults, then --preset, then the flags given.
+    """The settings that the command line asks for: defaults, then --preset or --config, then the flags given.
+
+    `--rl=:key=value` and `--encoder=:key=value` change options of what the preset has, for --objective see
+    `with_objectives`.
 
     Args:
         values: parsed flags, as `define_config_flags` defines them.
@@ -149,22 +206,27 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
         for name, info in INFOS.items()
         if values[info.flag or name].present
     }
+    base, _ = _base(values, given.get("game"))
+    for name in ("objectives", "imports"):
+        if name in given:
+            texts = tuple(given[name])
+            given[name] = () if texts in (("none",), ("",)) else texts
+    if "imports" in given:
+        given["imports"] = tuple(map(plugins.located, given["imports"]))
     if "objectives" in given:
-        texts = tuple(given["objectives"])
-        given["objectives"] = () if texts in (("none",), ("",)) else texts
-    preset = values["preset"].value
-    settings = dict(given)
-    if values["preset"].present:
-        if preset not in PRESETS:
-            raise ConfigError(f"--preset={preset}: {specs.choices_text(preset, PRESETS)}")
-        settings = {**preset_values(preset, given.get("game")), **given}
-    shorts = {name: values[name].value for name in RL_OPTIONS if values[name].present}
-    rl = settings.get("rl", Config.rl)
-    config = Config(**{**settings, "rl": with_rl_options(rl, shorts, explicit="rl" in given)})
+        given["objectives"] = with_objectives(base.get("objectives", ()), given["objectives"])
+    for name in ("rl", "encoder"):
+        if name in given:
+            try:
+                given[name] = specs.overlaid(base.get(name, getattr(Config, name)), given[name])
+            except specs.SpecError as error:
+                raise ConfigError(f"--{name}={given[name]}: {error}") from None
+    config = Config(**{**base, **given})
 
-    source = ENCODER_PRESETS.get(preset)
+    preset = values["preset"].value or ""
+    source = source_preset(preset, ENCODER_PRESETS)
     # A preset's encoder is only asked for while its mode is: --mode beside it may need none.
-    if source and config.mode == PRESETS[preset]["mode"]:
+    if source and config.mode == preset_values(preset.partition("+")[0])["mode"]:
         hint = f"--preset={source} --game={config.game} --out=PATH makes one"
         modes.check(config, needs_encoder=True, hint=hint, complete=complete)
     else:
@@ -230,18 +292,23 @@ def fail(message: Any, status: int = 2) -> NoReturn:
 
 
 def parse(
-    argv: list[str], values: flags.FlagValues = flags.FLAGS, positional: str | None = None
+    argv: list[str],
+    values: flags.FlagValues = flags.FLAGS,
+    positional: str | None = None,
+    about: str = "",
 ) -> list[str]:
-    """Parses a command line; exits with one line and status 2 where it is not valid.
+    """Parses a command line; exits with one line and status 2 where it is not valid, with 0 after --help.
 
     Args:
         argv: the program's name and its arguments.
         values: where the flags are defined.
         positional: a flag whose value, or values, may be given without its name; None for none.
+        about: what the program does, for --help.
 
     Returns:
         [the program's name].
     """
+    help.if_asked(argv, about, values)
     # absl would wait for a pipe there, read a device without end, and end in tracebacks.
     if any(argument.lstrip("-").partition("=")[0] == "flagfile" for argument in argv[1:]):
         fail("--flagfile: not taken; write the flags themselves, or use --preset")
@@ -254,9 +321,7 @@ def parse(
             values[positional].parse(rest[1:] if several else rest[1])
             del rest[1 : None if several else 2]
     except flags.UnrecognizedFlagError as error:
-        near = specs.near(error.flagname, values)
-        suggestion = f"did you mean {' or '.join(f'--{name}' for name in near)}? " if near else ""
-        fail(f"--{error.flagname}: no such flag; {suggestion}--helpfull lists them all")
+        fail(f"--{error.flagname}: {unknown(error.flagname, values)}")
     except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
         fail(str(error).removeprefix("flag "))
     for name in values:
@@ -300,10 +365,12 @@ def run(main: Callable[[list[str]], Any], positional: str | None = None) -> None
     """Runs an entry point: parses the flags, and ends with a line and a status where it fails; see `guarded`.
 
     Args:
-        main: takes [the program's name]; may return the exit status.
+        main: takes [the program's name]; may return the exit status. Its module's docstring begins --help.
         positional: see `parse`.
     """
     # absl prints what libraries log, and jax logs every accelerator that it does not find.
     logging.getLogger("jax").setLevel(logging.WARNING)
     display.secure()
-    app.run(guarded(main), flags_parser=functools.partial(parse, positional=positional))
+    function = main.func if isinstance(main, functools.partial) else main
+    about = sys.modules[function.__module__].__doc__ or ""
+    app.run(guarded(main), flags_parser=functools.partial(parse, positional=positional, about=about))

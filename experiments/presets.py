@@ -1,13 +1,16 @@
 """Named settings for experiments.train: every arm of the thesis, a demonstration, small Catch runs.
 
 A preset is a dict of `srl_jax.config.Config` fields; what it leaves out keeps its default, and
-flags given beside it override it. The thesis is Guberina & Desta, 2022; its figures' arms keep
+flags given beside it override it. `thesis/joint_256+small` is a preset that the parts behind it change, one
+after the other: `PIECES`, or presets. The thesis is Guberina & Desta, 2022; its figures' arms keep
 their names here.
 """
 
+from collections.abc import Callable, Mapping
 from typing import Any
 
-from srl_jax.specs import split
+from srl_jax.errors import ConfigError
+from srl_jax.specs import choices_text, join, split
 
 _RECONSTRUCTION = "reconstruction:weight=1"
 _FORWARD = "forward_pixels:weight=1"
@@ -47,7 +50,7 @@ _CATCH = {
     "frame_size": 42,
     "lr_rl": 2e-3,
     "lr_srl": 2e-3,
-    "lr_final": 0.05,
+    "lr_final_share": 0.05,
     "steps": 70_000,
     "batch_size": 64,
     "buffer_size": 50_000,
@@ -102,11 +105,35 @@ def _small(values: dict[str, Any]) -> dict[str, Any]:
     """An arm at the size of Catch, for a whole figure in an hour: `tiny` stands for both encoders, without a
     bottleneck for nature, with as many features for the larger one. All start as the textbook's."""
     name, options = split(values["encoder"])
-    own = {**_CATCH, **_SHORT, "encoder": f"tiny:features={options['features'] if name == 'sac_ae' else 0}"}
+    encoder = "tiny" if name == "tiny" else f"tiny:features={options.get('features', 0)}"
+    own = {**_CATCH, **_SHORT, "encoder": encoder}
     if values["mode"] == "pretrain":
         own["steps"] = 3 * own["steps"] // 10  # as 15 epochs to 50
     return {**values, **own}
 
+
+def _textbook(values: dict[str, Any]) -> dict[str, Any]:
+    """Without the five choices, and the decoder's, of `_START` and `_RAINBOW`."""
+    own = {}
+    for field, choices in (("rl", _RAINBOW), ("encoder", _NATURE)):
+        name, options = split(values[field])
+        left_out = split(choices)[1]
+        own[field] = join(name, {key: x for key, x in options.items() if key not in left_out})
+    return {**values, **own}
+
+
+PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "small": _small,
+    "textbook": _textbook,
+    "aug": lambda values: {**values, **_AUG},
+}
+"""What may stand behind a preset and a +: functions of its settings."""
+
+PIECES_HELP = {
+    "small": "at the size of Catch, minutes a run",
+    "textbook": "without the five choices that the thesis' presets make beside the textbook's agent",
+    "aug": "with random shift of all frames",
+}
 
 PRESETS: dict[str, dict[str, Any]] = {
     **{f"thesis/{name}": values for name, values in _ARMS.items()},
@@ -159,16 +186,60 @@ _SOLVED = {"Pong": 20.0}
 """Mean evaluation return at which the thesis' runs of a game stop early."""
 
 
+def parts(name: str) -> list[str]:
+    """The preset that a name begins with, and what stands behind it.
+
+    Raises:
+        ConfigError: one of them is unknown; the line begins with the name.
+    """
+    first, *rest = name.split("+")
+    if first in PIECES:
+        raise ConfigError(f"{name}: {first} changes a preset; write it behind one, thesis/joint_256+{first}")
+    for part, known in ((first, PRESETS), *((part, {**PIECES, **PRESETS}) for part in rest)):
+        if part not in known:
+            raise ConfigError(f"{name}: {choices_text(part, known)}")
+    return [first, *rest]
+
+
 def preset_values(name: str, game: str | None = None) -> dict[str, Any]:
     """The fields that a preset sets.
 
     Args:
-        name: a key of `PRESETS`.
+        name: a key of `PRESETS`, or several with + between them; later ones override.
         game: the game, where it is not the preset's own; a thesis run stops early in some games
             only.
+
+    Raises:
+        ConfigError: see `parts`.
     """
-    values = dict(PRESETS[name])
+    first, *rest = parts(name)
+    values = dict(PRESETS[first])
+    for part in rest:
+        values = PIECES[part](values) if part in PIECES else {**values, **PRESETS[part]}
     game = game or values["game"]
-    if name.startswith("thesis/") and values["mode"] != "pretrain" and game in _SOLVED:
+    whole = first.startswith("thesis/") and "small" not in rest
+    if whole and values["mode"] != "pretrain" and game in _SOLVED:
         values["stop_at_return"] = _SOLVED[game]
     return values
+
+
+def source_preset(name: str, table: Mapping[str, str]) -> str:
+    """The preset of the run that a preset's needs, changed likewise; "" where it needs none.
+
+    Args:
+        name: see `preset_values`.
+        table: `ENCODER_PRESETS` or `POLICY_PRESETS`.
+    """
+    first, *rest = name.split("+")
+    return "+".join((table[first], *rest)) if first in table else ""
+
+
+def summary(name: str) -> str:
+    """What a preset trains, in a line."""
+    values = preset_values(name)
+    losses = [split(text)[0] for text in values.get("objectives", ())]
+    name, options = split(values["encoder"])
+    encoder = name + (f" of {options['features']} features" if "features" in options else "")
+    shift = ["random shift"] if values.get("augment") == "all" else []
+    what = [values["mode"], encoder, " + ".join(losses), *shift, f"{values['steps']:,} env steps"]
+    return f"{values['game']}: {', '.join(filter(None, what))}"

@@ -24,15 +24,16 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments.stopping import signals
-from experiments.train import check_extras
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
 from srl_jax.envs import CATCH, GAMES
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import Progress, hms
 from srl_jax.specs import Info, choices_text, value_text
+
+from . import flags as config_flags
+from .stopping import signals
+from .train import check_extras
 
 FLAGS = flags.FLAGS
 

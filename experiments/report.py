@@ -10,9 +10,10 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import plots
 from srl_jax.errors import ConfigError, SaveError
+
+from . import flags as config_flags
+from . import plots
 
 FLAGS = flags.FLAGS
 
@@ -121,7 +122,7 @@ def report(values: flags.FlagValues) -> Path:
             raise ConfigError(f"--runs={root}: no such directory")
     if not plots.available():
         raise ConfigError("the pictures of a report need matplotlib and Pillow: pip install 'srl-jax[plots]'")
-    from experiments.reporting import page
+    from .reporting import page
 
     same = {name: values[name].value for name in ("baseline", "force", "finished_only", "media")}
     write(path, page.build(*runs, reach=reach, **same))
@@ -135,6 +136,11 @@ def main(argv: list[str]) -> None:
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     define_flags()
     config_flags.run(main, positional="runs")
+
+
+if __name__ == "__main__":
+    cli()

@@ -22,9 +22,10 @@ import tempfile
 from collections.abc import Callable, Mapping, MutableMapping
 from pathlib import Path
 
-from experiments import control_groups
 from srl_jax import display
 from srl_jax.errors import ConfigError
+
+from . import control_groups
 
 GUARD = "SRL_JAX_RUNTIME"
 """Set in the process that `prepare` started; such a process is not started again."""
@@ -270,9 +271,9 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
         cores=cores(),
         works=lambda flags: remembered(flags, folder),
     )
-    hint = "(--tune_runtime=off leaves the environment alone)"
+    hint = "(--tune_runtime=off sets none)"
     if _AT_START.keys() & new.keys() and GUARD not in env and sys.executable:
-        _say(f"restarting with {_shown(new)} {hint}")
+        _say(f"restarting with {len(new)} variables that make jax faster here {hint}")
         if sys.stdout is not None:
             sys.stdout.flush()
         try:
@@ -281,7 +282,7 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
             _say(f"not restarted: {error.strerror}")
     new = {name: value for name, value in new.items() if name not in _AT_START}
     if new:
-        _say(f"running with {_shown(new)} {hint}")
+        _say(f"{len(new)} variables that make jax faster here are set {hint}")
         env.update(new)
 
 
@@ -301,7 +302,3 @@ def check_device(env: Mapping[str, str] = os.environ) -> None:
             f"JAX_PLATFORMS={env.get('JAX_PLATFORMS', '')}: jax finds no such device{why}; "
             "JAX_PLATFORMS=cpu runs on the processor"
         ) from None
-
-
-def _shown(variables: Mapping[str, str]) -> str:
-    return " ".join(f"{name}={value}" for name, value in variables.items())

@@ -4,7 +4,8 @@ A run for each preset, game and seed, and the runs whose encoder or policy these
 with a run directory of its own, --out/GAME/ARM/seedN. Given again, the command runs what is missing or
 broken; with --out alone it goes on with everything that was ever planned there. Ctrl-C, SIGTERM, SIGHUP and
 SIGUSR1 write a checkpoint of each run and end. `--status` says how far a sweep is, `--dry_run` what one would
-do.
+do. `--grid=lr_rl=1e-4,3e-4 --grid=batch_size=32,64` tries each combination; a table of the arms, the best one
+first, comes at the end.
 
 Flags of experiments.train beside these are given to every run, but --steps: pretraining takes 0.3 of it, as
 in the thesis. Bad input ends with one line on stderr and exit status 2 before anything is written. Exit
@@ -17,16 +18,19 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments.sweeping import launching, local, machine, manifest, plan, resolving, speed, table
-from experiments.sweeping.launching import Launcher, Outcome
-from experiments.sweeping.manifest import Entry
-from experiments.sweeping.plan import Planned
 from srl_jax import display, rundir
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import hms
 from srl_jax.specs import Info, value_text
+
+from . import collect
+from . import flags as config_flags
+from .presets import preset_values
+from .sweeping import best, launching, local, machine, manifest, plan, resolving, speed, table
+from .sweeping.launching import Launcher, Outcome
+from .sweeping.manifest import Entry
+from .sweeping.plan import Planned
 
 FLAGS = flags.FLAGS
 
@@ -46,6 +50,13 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     config_flags.define_runtime_flag(values)
     flags.DEFINE_list(
         "presets", None, "what is compared: presets, or patterns as in thesis/*", flag_values=values
+    )
+    flags.DEFINE_multi_string(
+        "grid",
+        None,
+        "FLAG=VALUE,VALUE: each preset with each of these values, an arm each; repeated: with each "
+        "combination; a ; separates values that have commas",
+        flag_values=values,
     )
     flags.DEFINE_list("games", None, "to run each on; each preset's own if not given", flag_values=values)
     flags.DEFINE_string("seeds", "1", "how many seeds, 5, or which ones: 0,3,7 or 3,", flag_values=values)
@@ -110,7 +121,7 @@ def given_flags(values: flags.FlagValues) -> dict[str, str | tuple[str, ...]]:
     """
     names = [info.flag or name for name, info in INFOS.items()]
     found: dict[str, str | tuple[str, ...]] = {}
-    for name in (*names, *config_flags.RL_OPTIONS, "preset", "tune_runtime"):
+    for name in (*names, "preset", "config", "tune_runtime"):
         if not values[name].present:
             continue
         if name in plan.OWN:
@@ -120,6 +131,18 @@ def given_flags(values: flags.FlagValues) -> dict[str, str | tuple[str, ...]]:
             tuple(value) if isinstance(value, list) else "off" if value is None else value_text(value)
         )
     return found
+
+
+def say_what_is_replaced(values: flags.FlagValues, runs: Sequence[Planned]) -> None:
+    """Says in a line which presets' objectives are replaced by those of --objective."""
+    given = values["objective"].value or ()
+    whose = [
+        preset
+        for preset in dict.fromkeys(run.preset for run in runs)
+        if config_flags.replaced_objectives(given, preset_values(preset).get("objectives", ()), preset)
+    ]
+    if whose:
+        display.say(config_flags.replaced_objectives(given, ("those",), ", ".join(whose)))
 
 
 def run_sweep(
@@ -158,7 +181,7 @@ def run_sweep(
     rundir.check_free(root)
     executor: Launcher
     if launcher == "ray":
-        from experiments.sweeping.ray_launcher import Ray
+        from .sweeping.ray_launcher import Ray
 
         executor = Ray(root, workers, cpus_per_run, gpus_per_run, retries, ray_address, command)
     else:
@@ -265,12 +288,13 @@ def chosen_runs(values: flags.FlagValues, root: Path) -> list[Planned]:
     given = given_flags(values)
     if values["presets"].value:
         arms = [plan.arm_of(preset) for preset in plan.presets(values["presets"].value)]
+        arms = plan.grid(arms, values["grid"].value or [], given)
         seeds = plan.parse_seeds(values["seeds"].value)
         return plan.plan(arms, values["games"].value or [], seeds, given)
     entries = manifest.read(root)
     if not entries:
         raise ConfigError("--presets: missing; name some, as in --presets=thesis/joint_256,thesis/rl_only_*")
-    if flag := next((name for name in ("games", "seeds", *given) if values[name].present), None):
+    if flag := next((name for name in ("games", "seeds", "grid", *given) if values[name].present), None):
         raise ConfigError(
             f"--{flag}: only with --presets; without it, the sweep in --out goes on as it was planned"
         )
@@ -292,16 +316,26 @@ def main(argv: list[str]) -> int:
         display.result("\n".join(table.status(root, entries, workers)))
         return 0
     runs = chosen_runs(FLAGS, root)
+    say_what_is_replaced(FLAGS, runs)
     if FLAGS.dry_run:
         display.result("\n".join(dry_run(root, runs, **options)))
         return 0
     try:
         outcome = run_sweep(root, runs, **options)
+        if outcome.status < 128:  # not told to end
+            here = [root / run.name for run in runs if (root / run.name / "config.json").exists()]
+            if lines := best.lines([collect.load_run(path) for path in here]):
+                display.result("\n".join(lines))
     except OSError as error:
         raise SaveError(f"--out={FLAGS.out}: {error.strerror or error}") from error
     return outcome.status
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     define_flags()
     config_flags.run(main)
+
+
+if __name__ == "__main__":
+    cli()

@@ -16,15 +16,16 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import runtime
-from experiments.directories import all_to_resume, check_out, going_on, run_directory, say_anew
-from experiments.stopping import signals
-from srl_jax import display
+from srl_jax import display, plugins
 from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.rundir import check_free
 from srl_jax.specs import build, parse
+
+from . import flags as config_flags
+from . import runtime
+from .directories import all_to_resume, check_out, going_on, run_directory, say_anew
+from .stopping import signals
 
 FLAGS = flags.FLAGS
 
@@ -109,13 +110,16 @@ def interrupt() -> None:
 
 
 def resolved(config: Config) -> Config:
-    """`srl_jax.config.resolve` with the project's registries, and a trial build; imports jax.
+    """`srl_jax.config.resolve` with the registries and what --import adds, and a trial build; imports jax.
 
     Raises:
-        ConfigError: a specification is not valid, or cannot be built for these frames.
+        ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
+            these frames.
     """
     from srl_jax import encoders, objectives, rl
     from srl_jax.types import Context
+
+    plugins.load(config.imports)
 
     full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
     # Options may be valid one by one and not together, or not for these frames: only a factory
@@ -147,6 +151,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     """
     config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
     if values["print_config"].value:
+        config_flags.say_what_is_replaced(values)
         display.result(resolved(config).to_json())
         return 0
     seeds = check_seeds(values)
@@ -174,6 +179,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
     check_paths(needed)
     checkpoint.check_sources(needed)
+    config_flags.say_what_is_replaced(values)
     if not resume and not values["overwrite"].value:
         for directory, _ in runs:
             say_anew(directory)
@@ -202,8 +208,8 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
     Raises:
         SaveError: they cannot be written.
     """
-    from experiments import plots
-    from experiments.draw import draw_run
+    from . import plots
+    from .draw import draw_run
 
     if not plots.available():
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
@@ -221,6 +227,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     return train(FLAGS, prepare)
 
 
-if __name__ == "__main__":
+def cli() -> None:
+    """Runs this entry point as a program."""
     define_flags()
     config_flags.run(functools.partial(main, prepare=runtime.prepare))
+
+
+if __name__ == "__main__":
+    cli()

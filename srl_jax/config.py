@@ -33,6 +33,9 @@ _ABOUT = (*_MADE_BY, "started", "continued")
 SOURCES = ("encoder_from", "policy_from")
 """The fields that name another run."""
 
+_RENAMED = {"lr_final": "lr_final_share"}
+"""Fields of earlier config.json files by the names that they have now."""
+
 PARTIAL = "config.json.partial"
 """The name under which it is written, so that no process that is killed leaves half of it."""
 
@@ -63,10 +66,18 @@ class Config:
         str, "rl_only", "; ".join(f"{m.name}: {m.help}" for m in modes.MODES.values()),
         choices=tuple(modes.MODES),
     )  # fmt: skip
-    rl: str = _value(str, "rainbow", "RL algorithm, name:key=value,...")
-    encoder: str = _value(str, "nature", "encoder that all losses share, name:key=value,...")
+    rl: str = _value(
+        str, "rainbow", "RL algorithm, name:key=value,...; :key=value,... changes options of the preset's"
+    )
+    encoder: str = _value(
+        str,
+        "nature",
+        "encoder that all losses share, name:key=value,...; :key=value,... changes the preset's",
+    )
     objectives: tuple[str, ...] = _value(
-        tuple, (), "representation loss, name:key=value,...; may be repeated; none for none",
+        tuple, (),
+        "representation loss, name:key=value,...; may be repeated; none for none; beside a preset, +name:... "
+        "adds one to its own, or replaces the one of that name, and -name leaves one out",
         flag="objective",
     )  # fmt: skip
     augment: str = _value(
@@ -74,7 +85,7 @@ class Config:
         choices=("none", "srl", "all"),
     )  # fmt: skip
     srl_every: int = _value(
-        int, 1, "representation losses are computed in every so manyth update", "updates", minimum=1
+        int, 1, "updates from one with representation losses to the next", "updates", minimum=1
     )
     encoder_optimizer: str = _value(
         str, "separate",
@@ -114,8 +125,8 @@ class Config:
         "learning rate of the encoder's second Adam, the representation's, where it has two; 0: lr_srl",
         minimum=0,
     )  # fmt: skip
-    lr_final: float = _share(
-        1.0, "what is left of all learning rates at the end of the run; they fall linearly", "share"
+    lr_final_share: float = _share(
+        1.0, "share of all learning rates that is left at the end of the run; they fall linearly", "share"
     )
     decoder_weight_decay: float = _value(
         float, 1e-7, "L2 weight decay of the decoders, added before Adam's scaling", minimum=0
@@ -132,9 +143,9 @@ class Config:
     eps_final: float = _share(0.05, "epsilon of the training policy at the end")
     eps_anneal_steps: int = _steps(1_000_000, "length of epsilon's linear schedule")
     eps_eval: float = _share(0.005, "epsilon at evaluation")
-    slow_update_every: int = _steps(500, "how often the slow network is copied", unit="updates")
+    slow_update_every: int = _steps(500, "updates between two copies to the slow network", unit="updates")
 
-    eval_every: int = _steps(100_000, "how often the policy is evaluated (one epoch)")
+    eval_every: int = _steps(100_000, "env steps between two evaluations of the policy (one epoch)")
     eval_games: int = _value(int, 10, "full games of one evaluation", "games", minimum=1)
     eval_max_steps: int = _value(
         int, 27_000, "longest evaluation game (27,000 are 108,000 frames)", "env steps",
@@ -144,12 +155,12 @@ class Config:
         float, None, "mean evaluation return that ends the run early, or off", "unclipped score",
         optional=True,
     )  # fmt: skip
-    log_every: int = _steps(1_000, "how often a train row is written to metrics.jsonl")
+    log_every: int = _steps(1_000, "env steps between two train rows of metrics.jsonl")
     checkpoint_every: int = _steps(
-        0, "how often a checkpoint is written; 0: as often as evaluation", minimum=0
+        0, "env steps between two checkpoints; 0: as between evaluations", minimum=0
     )
     keep_encoder_every: int = _value(
-        int, 0, "the encoder of every so manyth checkpoint is kept in encoders/; 0: none", "checkpoints",
+        int, 0, "checkpoints between two whose encoder is kept in encoders/; 0: none is", "checkpoints",
         minimum=0,
     )  # fmt: skip
     keep_best: bool = _value(bool, True, "the parameters of the best evaluation so far are kept in best/")
@@ -197,12 +208,19 @@ class Config:
         str, "", "run directory or checkpoint whose policy --mode=pretrain acts with; empty: random"
     )
     pretrain_epsilon: float = _share(0.3, "epsilon of the policy that --mode=pretrain acts with")
+    imports: tuple[str, ...] = _value(
+        tuple, (),
+        "file (my_file.py) or module that registers objectives, encoders or RL algorithms of your own, see "
+        "srl_jax/plugins.py; may be repeated",
+        flag="import",
+    )  # fmt: skip
 
     def __post_init__(self):
-        if isinstance(self.objectives, list):
-            object.__setattr__(self, "objectives", tuple(self.objectives))
         for name, info in INFOS.items():
             value = getattr(self, name)
+            if info.kind is tuple and isinstance(value, list):
+                value = tuple(value)
+                object.__setattr__(self, name, value)
             # JSON and people write 1 for 1.0; one type keeps the round trip exact.
             if info.kind is float and type(value) is int and abs(value) <= specs.LIMITS[float]:
                 value = float(value)
@@ -246,7 +264,7 @@ class Config:
             raise ConfigError(f"config: not JSON: {error}") from None
         if not isinstance(values, dict):
             raise ConfigError("config: not a JSON object")
-        values = {name: value for name, value in values.items() if name not in _ABOUT}
+        values = {_RENAMED.get(name, name): value for name, value in values.items() if name not in _ABOUT}
         for name in values:
             if name not in INFOS:
                 raise ConfigError(f"config: no field {name!r}; {specs.choices_text(name, INFOS)}")
@@ -310,6 +328,19 @@ def resolve(
     )
 
 
+def unresolved(config: Config) -> Config:
+    """The config with 0 where `resolve` would put the value that is there: it follows other fields again."""
+    defaults = {name: 0 for name in ("lr_encoder", "lr_encoder_srl", "checkpoint_every")}
+    bare = dataclasses.replace(config, **defaults)
+    followed = {
+        "lr_encoder": modes.encoder_learning_rate(bare),
+        "lr_encoder_srl": modes.second_learning_rate(bare),
+        "checkpoint_every": config.eval_every,
+    }
+    same = {name: 0 for name, value in followed.items() if getattr(config, name) == value}
+    return dataclasses.replace(config, **same)
+
+
 def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS)) -> str:
     """What differs of these fields, `steps is 1000 there and 2000 here, ...`; "" if nothing."""
     pairs = ((name, getattr(there, name), getattr(here, name)) for name in names)
@@ -317,9 +348,9 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
 
 
 def another_run(there: Config, here: Config) -> str:
-    """`difference` of what makes two runs two: the runs that they start from may lie elsewhere by now."""
+    """`difference` of what makes two runs two: what they start from and import may lie elsewhere by now."""
     same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
-    return difference(there, dataclasses.replace(here, **same))
+    return difference(there, dataclasses.replace(here, **same, imports=there.imports))
 
 
 def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:

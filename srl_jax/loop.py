@@ -252,7 +252,7 @@ class Run:
     @property
     def hyper(self) -> Hyper:
         """The numbers of the next update."""
-        if self.config.lr_final == 1.0:
+        if self.config.lr_final_share == 1.0:
             return self.agent.hyper
         rates = schedules.learning_rates(self.config, self.learning_rates, self.env_steps)
         return self.agent.hyper._replace(learning_rates=rates)

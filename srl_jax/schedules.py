@@ -20,8 +20,8 @@ def beta(config: Config, env_steps: int) -> float:
 
 
 def learning_rates(config: Config, rates: dict[str, float], env_steps: int) -> dict[str, np.float32]:
-    """Learning rates on their way to `lr_final` of what they are in `rates`."""
-    left = linear(1.0, config.lr_final, config.steps, env_steps)
+    """Learning rates on their way to `lr_final_share` of what they are in `rates`."""
+    left = linear(1.0, config.lr_final_share, config.steps, env_steps)
     return {name: np.float32(rate * left) for name, rate in rates.items()}
 
 

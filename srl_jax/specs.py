@@ -211,6 +211,22 @@ def join(name: str, options: Mapping[str, Any]) -> str:
     return name + ":" + ",".join(f"{key}={value_text(value)}" for key, value in options.items())
 
 
+def overlaid(base: str, text: str) -> str:
+    """What a specification is that is given beside another one.
+
+    Args:
+        base: `name:key=value,...`, of a preset, say.
+        text: `:key=value,...` changes these options of the base; anything else takes its place.
+
+    Raises:
+        SpecError: either is not the syntax, where the base is changed.
+    """
+    if not text.lstrip().startswith(":"):
+        return text
+    name, options = split(base)
+    return join(name, options | split(name + text.lstrip())[1])
+
+
 def option_defaults(factory: Callable) -> dict[str, Any]:
     """The options of a factory: its keyword-only parameters with their defaults, in order.
 

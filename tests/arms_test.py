@@ -79,7 +79,7 @@ def test_a_figure_of_ones_own(tmp_path):
         ({"arms": [{"name": "a"}]}, "arm 1 has no 'preset'"),
         (
             {"arms": [{"name": "a", "preset": "catch/join"}]},
-            "arm 1: no preset 'catch/join'; did you mean catch/joint",
+            "arm 1: no preset catch/join: did you mean catch/joint",
         ),
         ({"arms": [GOOD["arms"][0]] * 2}, "two arms have the same name"),
         (
@@ -88,9 +88,9 @@ def test_a_figure_of_ones_own(tmp_path):
         ),
         (
             {"arms": [{**GOOD["arms"][0], "flags": {"lr": 1}}]},
-            "arm 1: no flag 'lr'; did you mean lr_encoder or lr_encoder_srl or lr_final or lr_rl or lr_srl?",
+            "arm 1: no flag 'lr'; did you mean lr_encoder or lr_encoder_srl or lr_final_share or lr_rl or",
         ),
-        ({"arms": [{**GOOD["arms"][0], "flags": {"qqq": 1}}]}, "arm 1: no flag 'qqq'; python -m experiments"),
+        ({"arms": [{**GOOD["arms"][0], "flags": {"qqq": 1}}]}, "arm 1: no flag 'qqq'; srl-jax train"),
         (
             {"arms": [{**GOOD["arms"][0], "flags": {"srl_every": None}}]},
             "flag srl_every of arm 1: not a text",
@@ -105,10 +105,11 @@ def test_a_bad_figure_is_refused_by_name(tmp_path, change, told):
     assert str(error.value).startswith(f"--figure={path}: {told}") and "\n" not in str(error.value)
 
 
-def test_options_of_rl_are_flags_of_an_arm_as_well(tmp_path):
+def test_a_flag_that_there_was_is_answered_with_the_new_way(tmp_path):
     path = tmp_path / "mine.json"
     path.write_text(json.dumps({**GOOD, "arms": [{**GOOD["arms"][0], "flags": {"n_step": 5}}]}))
-    assert arms.read_figure(path).arms[0].flags == {"n_step": "5"}
+    with pytest.raises(ConfigError, match="arm 1: --n_step is now --rl=:n_step=..."):
+        arms.read_figure(path)
 
 
 def test_no_file_and_no_json_are_refused(tmp_path):

@@ -15,7 +15,7 @@ from absl import flags
 
 import srl_jax
 from experiments import flags as config_flags
-from experiments import train
+from experiments import resume, train
 from experiments.presets import PRESETS
 from srl_jax import checkpoint, rundir
 from srl_jax.config import INFOS, Config
@@ -120,17 +120,55 @@ def test_flags_override_a_preset_even_where_they_give_the_default():
     assert _config(preset, "--mode=rl_only", "--objective=none").objectives == ()
 
 
-def test_short_flags_stand_for_options_of_rl():
-    assert _config("--n_step=5", "--num_atoms=21").rl == "rainbow:n_step=5,atoms=21"
-    assert _config("--rl=dqn:double=true", "--alpha=1").rl == "dqn:double=true,alpha=1.0"
-    assert _config("--rl=rainbow:v_min=-1", "--v_min=-1.0").rl == "rainbow:v_min=-1"
-    assert _config("--preset=catch/rl_only", "--noisy_std=0.5").rl == (
-        "rainbow:v_min=-2,v_max=2,hidden=128,noisy_std=0.5"
+def test_a_colon_in_front_changes_options_and_keeps_the_rest():
+    assert _config("--rl=:n_step=5,atoms=21").rl == "rainbow:n_step=5,atoms=21"
+    preset = "--preset=catch/rl_only"
+    assert _config(preset, "--rl=:noisy_std=0.5,v_max=3").rl == (
+        "rainbow:v_min=-2,v_max=3,hidden=128,noisy_std=0.5"
     )
-    # A preset's option is overridden like the rest of it; a typed one contradicts.
-    assert config_flags.with_rl_options("c51:n_step=1", {"n_step": 3}, False) == "c51:n_step=3"
-    with pytest.raises(ConfigError, match="--n_step=3: contradicts --rl=c51:n_step=1"):
-        _config("--rl=c51:n_step=1", "--n_step=3")
+    assert _config(preset, "--rl=dqn").rl == "dqn"
+    assert _config("--preset=thesis/rl_only_256", "--encoder=:features=9").encoder.startswith(
+        "sac_ae:features=9,init=he,"
+    )
+
+
+@pytest.mark.parametrize(
+    ("given", "left"),
+    [
+        (["inverse"], ["inverse"]),
+        (["+inverse:weight=2"], ["reconstruction:weight=1", "latent_l2:weight=1e-6", "inverse:weight=2"]),
+        (["-latent_l2"], ["reconstruction:weight=1"]),
+        (["+reconstruction:weight=3"], ["reconstruction:weight=3", "latent_l2:weight=1e-6"]),
+        (["-reconstruction", "+inverse"], ["latent_l2:weight=1e-6", "inverse"]),
+    ],
+)
+def test_objectives_replace_or_with_a_sign_add_and_leave_out(given, left):
+    flags = [f"--objective={text}" for text in given]
+    assert _config("--preset=catch/joint", *flags).objectives == tuple(left)
+
+
+def test_it_is_said_which_objectives_are_replaced(capsys, loop, tmp_path):
+    _train("--preset=catch/joint", "--objective=inverse", f"--out={tmp_path}/a")
+    assert (
+        "objective: inverse in place of reconstruction:weight=1 and latent_l2:weight=1e-6 of "
+        "--preset=catch/joint; --objective=+NAME adds to them\n"
+    ) in capsys.readouterr().err
+    _train("--preset=catch/joint", "--objective=+inverse", f"--out={tmp_path}/b")
+    _train("--game=Catch", "--mode=joint", "--objective=inverse", f"--out={tmp_path}/c")
+    assert "objective" not in capsys.readouterr().err
+
+
+def test_settings_come_from_a_config_file(tmp_path, loop):
+    out = tmp_path / "run"
+    _train("--preset=catch/joint", "--seed=3", "--lr_rl=1e-3", f"--out={out}")
+    ((first, _),) = loop.calls
+    for given in (out, out / "config.json"):
+        assert train.resolved(_config(f"--config={given}")) == first
+    # What followed from another value follows it again.
+    config = train.resolved(_config(f"--config={out}", "--lr_rl=5e-3", "--eval_every=500", "--seed=4"))
+    assert (config.lr_encoder, config.checkpoint_every, config.seed) == (5e-3, 500, 4)
+    assert config.objectives == first.objectives
+    assert _config(f"--config={out}", "--objective=+inverse").objectives[-1] == "inverse"
 
 
 BAD = [
@@ -162,7 +200,20 @@ BAD = [
     (["--steps", "abc"], "--steps=abc", "not a whole number"),
     (["--lr_rl=nan"], "--lr_rl=nan", "finite"),
     (["--gamma=1.5"], "--gamma=1.5", "at most 1"),
-    (["--n_step=0"], "--n_step=0", "at least 1"),
+    (["--n_step=3"], "--n_step", "is now --rl=:n_step=..."),
+    (["--num_atoms=3"], "--num_atoms", "is now --rl=:atoms=..."),
+    (["--lr_final=0.1"], "--lr_final", "is now --lr_final_share=..."),
+    (["--rl=:n_step=0"], "--rl=rainbow:n_step=0", "at least 1"),
+    (["--rl=:n_step"], "--rl=:n_step", "'n_step' is not key=value"),
+    (["--encoder=:n_step=1"], "--encoder=nature:n_step=1", "nature has no option"),
+    (["--preset=small"], "--preset=small", "thesis/joint_256+small"),
+    (["--preset=thesis/joint_256+smal"], "--preset=thesis/joint_256+smal", "did you mean small?"),
+    (["--preset=catch/joint", "--config=x"], "--config=x", "--preset=catch/joint; give one of them"),
+    (["--config=no/such"], "--config=no/such", "give a run's config.json"),
+    (["--config=pyproject.toml"], "--config=pyproject.toml", "not JSON"),
+    ([*JOINT, "--objective=+inverse"], "--objective=reconstruction", "replaces all"),
+    (["--preset=catch/joint", "--objective=-inverse"], "--objective=-inverse", "reconstruction, latent_l2"),
+    (["--import=no_such.py"], "--import=", "no such file"),
     (["--reward_clip=maybe"], "--reward_clip=maybe", "true or false"),
     (["--srl_every=4"], "--srl_every=4", "joint, decoupled"),
     (["--srl_every=0", *JOINT], "--srl_every=0", "at least 1"),
@@ -222,7 +273,7 @@ def test_a_later_flag_of_a_name_replaces_an_earlier_one():
         ("sweep", "presets", "separate values with commas"),
         ("figures", "games", "separate values with commas"),
         ("reference_policies", "games", "separate values with commas"),
-        ("soak", "only", "separate values with commas"),
+        ("soaking", "only", "separate values with commas"),
         ("benchmarks.bench", "rounds", "give it once"),
     ],
 )
@@ -355,11 +406,11 @@ def test_a_start_that_failed_is_in_nobodys_way(capsys, loop, tmp_path, monkeypat
     with monkeypatch.context() as patch:
         patch.setattr(loop, "train", failed)
         with pytest.raises(RuntimeError):
-            _train(*CATCH, "--n_step=7", f"--out={out}")
+            _train(*CATCH, "--rl=:n_step=7", f"--out={out}")
     assert (out / "config.json").exists()
     capsys.readouterr()
     for arguments in ([], ["--resume=auto"]):
-        assert _train(*CATCH, "--n_step=6", f"--out={out}", *arguments) == 0
+        assert _train(*CATCH, "--rl=:n_step=6", f"--out={out}", *arguments) == 0
         assert "n_step=6" in Config.load(out).rl
         assert capsys.readouterr().err == (f"resume: {out}: no checkpoint there yet; the run begins again\n")
 
@@ -492,6 +543,38 @@ def test_errors_are_one_line_and_have_a_status_of_their_own(error, status):
     assert (done.returncode, done.stdout, done.stderr) == (status, "", "error: two lines\n")
 
 
+def test_resume_needs_nothing_but_the_directory(loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    _train(*CATCH, "--lr_rl=1e-3", "--objective=inverse", "--mode=joint", f"--out={out}")
+    manifest = _checkpoint(out, 100)
+    _train(*resume.command_line(str(out)))
+    (_, (config, path)) = loop.calls
+    assert (config, path) == (Config.load(out), out)
+    assert loop.resumed[-1].path == checkpoint.read_manifest(out).path and manifest
+
+
+def test_resume_finds_the_seeds_of_a_process(loop, tmp_path):
+    for seed in (10, 2):
+        _train(*CATCH, f"--seed={seed}", f"--out={tmp_path}/runs/seed{seed}")
+    assert resume.command_line(f"{tmp_path}/runs") == [
+        f"--config={tmp_path}/runs/seed2/config.json", "--seeds=2,10", f"--out={tmp_path}/runs",
+        "--resume=auto",
+    ]  # fmt: skip
+
+
+def test_resume_refuses_what_is_no_run(tmp_path):
+    with pytest.raises(ConfigError, match="not a run directory"):
+        resume.command_line(str(tmp_path))
+    (tmp_path / "sweep.json").touch()
+    with pytest.raises(ConfigError, match="a sweep, with which srl-jax sweep --out="):
+        resume.command_line(str(tmp_path))
+    done = _python("-m", "experiments.resume")
+    assert (done.returncode, done.stderr) == (
+        2,
+        "error: name a run directory first: srl-jax resume runs/NAME\n",
+    )
+
+
 SHORT = SMALL | {"steps": 1200, "eval_every": 400}
 RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=off"]
 
@@ -518,7 +601,7 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
     line = f"stopped after {stopped} env steps; --resume=auto goes on from there, in {out}"
     assert line in printed.splitlines()
 
-    done = _python("-m", "experiments.train", *RUN, f"--out={out}", "--resume=auto")
+    done = _python("-m", "srl_jax", "resume", str(out), "--tune_runtime=off")
     assert done.returncode == 0, done.stderr
     assert f"1200 env steps, 145 updates; everything is in {out}" in done.stdout
     whole = tmp_path / "whole"
@@ -606,11 +689,6 @@ def test_the_entry_point_prints_its_config():
     done = _python("-m", "experiments.train", "--preset=thesis/joint_256", "--print_config")
     assert (done.returncode, done.stderr) == (0, "")
     assert Config.from_json(done.stdout).encoder.startswith("sac_ae:features=256,")
-
-
-def test_help_lists_the_flags():
-    done = _python("-m", "experiments.train", "--help")
-    assert "--steps: length of the run [env steps]" in done.stdout
 
 
 def test_nothing_that_is_checked_first_imports_jax():

@@ -320,3 +320,16 @@ def test_config_json_has_what_xla_was_told(tmp_path, monkeypatch):
     Config().save(tmp_path)
     told = json.loads((tmp_path / "config.json").read_text())["environment"]
     assert told == {"XLA_FLAGS": "--a --b", "NPROC": "2"} == told_to_xla()
+
+
+def test_a_config_of_before_a_field_was_renamed_is_read():
+    assert Config.from_json('{"lr_final": 0.25}') == Config(lr_final_share=0.25)
+
+
+def test_what_follows_from_other_fields_follows_again():
+    registries = {"rainbow": _rl}, {"nature": _encoder}, {"first": _objective}
+    for values in ({}, {"lr_encoder": 0.5}, {"checkpoint_every": 7}, {"mode": "frozen"}):
+        config = Config(rl="rainbow:n_step=3,alpha=0.5", encoder="nature:features=256", **values)
+        bare = config_module.unresolved(resolve(config, *registries))
+        assert bare == config
+        assert resolve(bare, *registries) == resolve(config, *registries)

@@ -542,7 +542,7 @@ def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
 
 def test_updates_are_compiled_once(joint):
     del joint
-    run = one_run(Config(**SMALL, lr_final=0.5))
+    run = one_run(Config(**SMALL, lr_final_share=0.5))
     (seed,) = run.seeds
     run.begin()
     for _ in range(30):
@@ -562,8 +562,8 @@ def test_config_is_data(joint):
 
 
 def test_learning_rates_fall_linearly_to_the_share_that_is_left():
-    def at(env_steps, lr_final):
-        config = Config(**{**SMALL, "steps": 200, "lr_final": lr_final})
+    def at(env_steps, share):
+        config = Config(**{**SMALL, "steps": 200, "lr_final_share": share})
         rates = schedules.learning_rates(config, {"encoder": 0.0, "rl": 4e-3}, env_steps)
         assert all(rate.dtype == np.float32 for rate in rates.values())
         return rates

@@ -1,13 +1,22 @@
-"""What the package says of itself, in several places at once."""
+"""What the package says of itself, in several places at once, what is installed, and its commands."""
 
+import importlib.metadata
+import os
 import pathlib
 import re
+import subprocess
+import sys
 import tomllib
+import zipfile
+
+import pytest
 
 import srl_jax
+from experiments import cli
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
-PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+PROJECT = PYPROJECT["project"]
 
 
 def _cited(field):
@@ -28,3 +37,79 @@ def test_the_licence_is_the_same_everywhere():
     assert "Apache License\n" in text and "Version 2.0, January 2004" in text
     assert "Copyright 2026 The srl_jax authors" in text and "[yyyy]" not in text
     assert "[LICENSE](LICENSE)" in (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_every_package_is_installed_but_what_only_a_checkout_needs():
+    named = PYPROJECT["tool"]["setuptools"]["packages"]
+    folders = {"experiments": "srl_jax.experiments", "srl_jax": "srl_jax"}
+    found = [
+        ".".join((name, *path.parent.relative_to(ROOT / folder).parts))
+        for folder, name in folders.items()
+        for path in (ROOT / folder).rglob("__init__.py")
+    ]
+    checkout_only = {"srl_jax.experiments.benchmarks", "srl_jax.experiments.soaking"}
+    assert sorted(named) == sorted(set(found) - checkout_only)
+
+
+def test_the_wheel_has_one_top_level_name_and_everything_that_runs(tmp_path):
+    if int(importlib.metadata.version("setuptools").split(".")[0]) < 77:
+        pytest.skip("the installed setuptools cannot build it")
+    for name in ("srl_jax", "experiments"):  # a build leaves files where it builds
+        for path in (ROOT / name).rglob("*"):
+            if path.is_file() and path.suffix != ".pyc" and "results" not in path.parts:
+                copy = tmp_path / "source" / path.relative_to(ROOT)
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                copy.symlink_to(path)
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        (tmp_path / "source" / name).symlink_to(ROOT / name)
+    code = "import sys; from setuptools import build_meta; build_meta.build_wheel(sys.argv[1])"
+    subprocess.run(
+        [sys.executable, "-c", code, tmp_path], cwd=tmp_path / "source", check=True, capture_output=True
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    with zipfile.ZipFile(wheel) as file:
+        names = file.namelist()
+        scripts = file.read(next(name for name in names if name.endswith("entry_points.txt"))).decode()
+        file.extractall(tmp_path / "installed")
+    assert {name.split("/")[0].split("-")[0] for name in names} == {"srl_jax"}
+    assert not [name for name in names if re.search("soak|benchmark|results/", name)]
+    assert "srl_jax/experiments/reporting/style.css" in names and "srl-jax = srl_jax.__main__:main" in scripts
+    done = _command("train", "--game=Pogn", cwd=tmp_path, env={"PYTHONPATH": str(tmp_path / "installed")})
+    assert (done.returncode, done.stderr[:19]) == (2, "error: --game=Pogn:")
+
+
+def _command(*arguments, cwd=ROOT, env=None):
+    return subprocess.run(
+        [sys.executable, "-m", "srl_jax", *arguments],
+        cwd=cwd,
+        env={**os.environ, **(env or {})},
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+
+
+@pytest.mark.parametrize("arguments", [(), ("--help",), ("help",)])
+def test_the_commands_are_listed_a_line_each(arguments):
+    done = _command(*arguments)
+    assert (done.returncode, done.stderr) == (0, "")
+    for name, command in cli.COMMANDS.items():
+        assert re.search(rf"^  srl-jax {name} .*  {re.escape(command.help)}$", done.stdout, re.MULTILINE)
+
+
+def test_an_unknown_command_is_answered_with_the_ones_there_are():
+    done = _command("evalute", "runs/x")
+    assert done.returncode == 2 and not done.stdout
+    assert done.stderr.startswith("error: evalute: no such command; did you mean evaluate? valid: train,")
+
+
+@pytest.mark.parametrize("name", cli.COMMANDS)
+def test_every_command_is_an_entry_point_that_imports_no_jax(name):
+    module = cli.COMMANDS[name].module or name
+    code = f"import sys, experiments.{module} as module; sys.exit('jax' in sys.modules or not module.cli)"
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60).returncode == 0
+
+
+def test_a_command_has_the_flags_of_its_entry_point():
+    done = _command("train", "--game=Pogn", "--out=x")
+    assert done.returncode == 2 and done.stderr.startswith("error: --game=Pogn: did you mean Pong?")

@@ -5,9 +5,17 @@ import dataclasses
 import pytest
 
 from experiments import train
-from experiments.presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, preset_values
+from experiments.presets import (
+    ENCODER_PRESETS,
+    POLICY_PRESETS,
+    PRESETS,
+    preset_values,
+    source_preset,
+    summary,
+)
 from srl_jax import modes, specs
 from srl_jax.config import Config
+from srl_jax.errors import ConfigError
 
 # The arms of every figure of the thesis, and the runs that make their encoders.
 ARMS = [
@@ -111,3 +119,46 @@ def test_only_pong_of_the_thesis_games_stops_early():
     assert "stop_at_return" not in preset_values("thesis/joint_256", "Breakout")
     assert "stop_at_return" not in preset_values("thesis/pretrain_256")
     assert "stop_at_return" not in PRESETS["thesis/joint_256"]
+
+
+@pytest.mark.parametrize("arm", ARMS)
+def test_small_is_a_piece_that_changes_any_preset(arm):
+    assert preset_values(f"thesis/{arm}+small") == preset_values(f"small/{arm}")
+
+
+def test_what_stands_later_overrides():
+    assert preset_values("catch/joint+catch/rl_only") == {
+        **PRESETS["catch/joint"],
+        **PRESETS["catch/rl_only"],
+    }
+    assert preset_values("thesis/joint_256+aug")["augment"] == "all"
+    textbook = preset_values("thesis/joint_256+textbook")
+    assert (textbook["rl"], textbook["encoder"]) == ("rainbow", "sac_ae:features=256")
+    assert textbook["stop_at_return"] == 20
+    assert preset_values("catch/joint+small+aug")["encoder"] == "tiny"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("thesis/joint_25", "did you mean thesis/joint_256"),
+        ("thesis/joint_256+smal", "did you mean small"),
+        ("small", "small changes a preset; write it behind one"),
+        ("catch/joint+", "valid: small, textbook, aug"),
+    ],
+)
+def test_a_preset_that_there_is_not_is_refused(name, told):
+    with pytest.raises(ConfigError) as error:
+        preset_values(name)
+    assert str(error.value).startswith(f"{name}: ") and told in str(error.value)
+
+
+def test_a_changed_preset_starts_from_one_that_is_changed_likewise():
+    assert source_preset("thesis/frozen_256+small", ENCODER_PRESETS) == "thesis/pretrain_256+small"
+    assert source_preset("thesis/joint_256+small", ENCODER_PRESETS) == ""
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_summary_is_a_line(name):
+    text = summary(name)
+    assert text.startswith(f"{PRESETS[name]['game']}: {PRESETS[name]['mode']}, ") and len(text) < 120

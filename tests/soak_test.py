@@ -1,11 +1,11 @@
-"""experiments/soak.py and its parts: their short versions, and whether they would notice."""
+"""experiments/soaking/__main__.py and the parts: their short versions, and whether they would notice."""
 
 import json
 
 import pytest
 
-from experiments import soak
 from experiments.soaking import Count, cost, damage, disk, kills, memory, small
+from experiments.soaking import __main__ as soak
 from srl_jax import checkpoint
 from srl_jax.errors import ConfigError
 

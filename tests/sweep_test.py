@@ -294,16 +294,37 @@ def test_command_lines_that_are_refused(tmp_path, arguments, says):
 
 
 def test_flags_of_training_go_to_every_run(tmp_path):
-    given = ("--steps=1e3", "--objective=inverse", "--nolife_loss", "--stop_at_return=off", "--n_step=2")
+    given = ("--steps=1e3", "--objective=inverse", "--nolife_loss", "--stop_at_return=off", "--rl=:n_step=2")
     values, root = _main(f"--out={tmp_path}", "--presets=small/joint_*", "--games=Catch", "--seeds=2", *given)
     runs = sweep.chosen_runs(values, root)
     assert runs[0].name == "Catch/joint_256/seed0"
     assert runs[0].flags == {
         "game": "Catch", "seed": "0", "objective": ("inverse",), "steps": "1000", "stop_at_return": "off",
-        "life_loss": "false", "n_step": "2",
+        "life_loss": "false", "rl": ":n_step=2",
     }  # fmt: skip
     with pytest.raises(ConfigError, match="--gpus_per_run: only --launcher=ray"):
         sweep.launcher_options(_main(f"--out={tmp_path}", "--gpus_per_run=1")[0])
+
+
+def test_a_grid_makes_arms_and_it_is_said_whose_objectives_are_replaced(tmp_path, capsys):
+    given = ("--grid", "lr_rl=1e-4,3e-4", "--objective=inverse")
+    values, root = _main(f"--out={tmp_path}", "--presets=small/joint_256,small/joint_50", *given)
+    runs = sweep.chosen_runs(values, root)
+    assert [run.name.split("/")[1] for run in runs] == [
+        f"{arm}_lr_rl={rate}" for arm in ("joint_256", "joint_50") for rate in ("1e-4", "3e-4")
+    ]
+    sweep.say_what_is_replaced(values, runs)
+    assert capsys.readouterr().err == (
+        "objective: inverse in place of those of small/joint_256, small/joint_50; "
+        "--objective=+NAME adds to them\n"
+    )
+    with pytest.raises(ConfigError, match="--grid: only with --presets"):
+        sweep.chosen_runs(_main(f"--out={tmp_path}", "--grid", "lr_rl=1,2")[0], _planned(tmp_path))
+
+
+def _planned(root):
+    manifest.write(root, {A: manifest.Entry(run(A), CONFIG)})
+    return root
 
 
 def test_a_sweep_goes_on_as_it_was_planned_where_no_presets_are_given(stubs):

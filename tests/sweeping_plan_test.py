@@ -2,10 +2,12 @@
 
 import pytest
 
+from experiments import collect
 from experiments.presets import PRESETS
-from experiments.sweeping import plan, resolving
+from experiments.sweeping import best, plan, resolving
 from experiments.sweeping.plan import Arm, Planned, arm_of
 from srl_jax.errors import ConfigError
+from tests.helpers import write_run
 
 
 def test_what_a_run_starts_from_is_planned_once_and_before_it():
@@ -89,7 +91,7 @@ def test_a_command_line_is_the_runs_own():
 
 
 def test_configurations_are_those_that_training_writes():
-    flags = {"encoder": "tiny:features=8", "objective": ("forward_pixels", "latent_l2"), "n_step": "2"}
+    flags = {"encoder": "tiny:features=8", "objective": ("forward_pixels", "latent_l2"), "rl": ":n_step=2"}
     (run,) = plan.plan([Arm("a", "small/joint_256", flags)], ["CatchDistractor"], [4], {"steps": "500"})
     (config,) = resolving.resolve_here([run]).values()
     assert (config.game, config.seed, config.steps) == ("CatchDistractor", 4, 500)
@@ -101,7 +103,10 @@ def test_configurations_are_those_that_training_writes():
 @pytest.mark.parametrize(
     "arm, says",
     [
-        (Arm("a", "small/joint_256", {"stepz": "3"}), "Catch/a/seed0: Unknown command line flag 'stepz'"),
+        (
+            Arm("a", "small/joint_256", {"stepz": "3"}),
+            "Catch/a/seed0: --stepz: no such flag; did you mean --steps",
+        ),
         (Arm("a", "small/joint_256", {"steps": "0"}), "Catch/a/seed0: --steps=0: must be at least 1"),
         (Arm("a", "small/rl_only_256", {"objective": ("x",)}), "runs no representation loss"),
         (Arm("a", "small/joint_256", {"objective": ("x",)}), "Catch/a/seed0: --objective=x"),
@@ -114,3 +119,65 @@ def test_configurations_are_those_that_training_writes():
 def test_settings_that_cannot_be_run_name_the_run(arm, says):
     with pytest.raises(ConfigError, match=says):
         resolving.resolve_here(plan.plan([arm], ["Catch"], [0]))
+
+
+def test_a_grid_is_an_arm_for_each_combination():
+    arms = plan.grid(
+        [Arm("a", "catch/joint"), Arm("b", "catch/rl_only")], ["lr_rl=1e-4, 3e-4", "rl=:n_step=1;dqn"], {}
+    )
+    assert [arm.name for arm in arms][:4] == [
+        "a_lr_rl=1e-4_rl=n_step=1", "a_lr_rl=1e-4_rl=dqn", "a_lr_rl=3e-4_rl=n_step=1", "a_lr_rl=3e-4_rl=dqn",
+    ]  # fmt: skip
+    assert len(arms) == 8 and arms[4].preset == "catch/rl_only"
+    assert arms[0].flags == {"lr_rl": "1e-4", "rl": ":n_step=1"}
+    runs = plan.plan(arms[:4], [], [0], {})
+    configs = resolving.resolve_here(runs)
+    assert {(config.lr_rl, config.rl.split(":")[0]) for config in configs.values()} == {
+        (lr, rl) for lr in (1e-4, 3e-4) for rl in ("rainbow", "dqn")
+    }
+    assert plan.grid(arms[:1], [], {}) == arms[:1]
+
+
+@pytest.mark.parametrize(
+    ("texts", "says"),
+    [
+        (["lr_rl"], "must be FLAG=VALUE,VALUE"),
+        (["=1"], "must be FLAG=VALUE,VALUE"),
+        (["lr_rl=1,,2"], "must be FLAG=VALUE,VALUE"),
+        (["lr=1,2"], "--lr: no such flag; did you mean --lr_encoder"),
+        (["n_step=1,2"], "--n_step: is now --rl=:n_step"),
+        (["gamma=0.9", "gamma=0.99"], "--gamma is given beside it"),
+        (["steps=1,2"], "--steps is given beside it"),
+    ],
+)
+def test_a_grid_that_makes_no_sense_is_refused(texts, says):
+    with pytest.raises(ConfigError, match=f"^--grid={texts[-1]}: {says}"):
+        plan.grid([Arm("a", "catch/joint")], texts, {"steps": "7"})
+
+
+def test_a_composed_preset_is_swept_with_what_it_starts_from():
+    (arm,) = map(plan.arm_of, plan.presets(["thesis/frozen_*+small"]))
+    assert arm == Arm("frozen_256_small", "thesis/frozen_256+small")
+    runs = plan.plan([arm], [], [0])
+    assert [run.name for run in runs if "rl_only" not in run.name] == [
+        "Catch/pretrain_256_small/seed0", "Catch/frozen_256_small/seed0",
+    ]  # fmt: skip
+    with pytest.raises(ConfigError, match="arm joint_smal: catch/joint.smal: did you mean small"):
+        plan.plan([plan.arm_of("catch/joint+smal")], [], [0])
+
+
+def test_the_best_arm_comes_first(tmp_path):
+    # Areas by hand: 1 and 1; 2 and 3, whose interval is 2.5 and 12.706 times 0.5 to either side.
+    for arm, returns in {"a": [(0, 2), (2, 0)], "b": [(1, 3), (2, 4)]}.items():
+        for seed, its in enumerate(returns):
+            write_run(tmp_path / "Catch" / arm / f"seed{seed}", its, seed=seed)
+    write_run(tmp_path / "CatchDistractor" / "a" / "seed0", game="CatchDistractor")
+    lines = best.lines(collect.load_runs(tmp_path))
+    assert [line.split() for line in lines[:3]] == [
+        ["Catch", "seeds", "area", "95", "%", "at", "the", "end"],
+        ["b", "2", "2.5", "[-3.853,", "8.853]", "3.5"],
+        ["a", "2", "1", "-", "1"],
+    ]
+    assert lines[3].startswith("area: mean evaluation return up to 100 env steps. The best of 2 is flattered")
+    assert len(lines) == 4
+    assert best.lines(collect.load_runs(tmp_path / "CatchDistractor")) == []

@@ -1,4 +1,4 @@
-"""experiments/sweeping/ray_launcher.py: what a worker does; `experiments.soak` has a cluster."""
+"""experiments/sweeping/ray_launcher.py: what a worker does; `experiments.soaking` has a cluster."""
 
 import importlib.util
 import json
@@ -86,9 +86,9 @@ def test_the_task_needs_nothing_but_its_texts(tmp_path):
     code = (
         "import json, marshal, sys, types; "
         "task = types.FunctionType(marshal.loads(bytes.fromhex(sys.argv[1])), {}); "
-        "print(json.dumps(task(sys.argv[2], 'a', 1)))"
+        "print(json.dumps(task(*sys.argv[2:], 'a', 1)))"
     )
     task = marshal.dumps(ray_launcher._task().__code__).hex()
-    line = [sys.executable, "-I", "-c", code, task, str(tmp_path)]
+    line = [sys.executable, "-I", "-c", code, task, str(tmp_path), ray_launcher.__name__]
     done = subprocess.run(line, capture_output=True, text=True)
     assert json.loads(done.stdout or "{}") == {"got": ["a", 1]}, done.stderr

@@ -19,15 +19,16 @@ from typing import Any
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import runtime
-from experiments.benchmarks import table
-from experiments.benchmarks.rows import CHECK_UPDATES, ROWS, SIDES, Side, series_of, sides_of
-from experiments.benchmarks.runner import TOLERANCE, CheckFailed, Results, measure
-from experiments.benchmarks.worker import ROOT, Worker, WorkerError
 from srl_jax.config import git_revision, versions
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
+
+from .. import flags as config_flags
+from .. import runtime
+from . import table
+from .rows import CHECK_UPDATES, ROWS, SIDES, Side, series_of, sides_of
+from .runner import TOLERANCE, CheckFailed, Results, measure
+from .worker import ROOT, Worker, WorkerError
 
 FLAGS = flags.FLAGS
 PYTHON = ".venv-bench/bin/python"

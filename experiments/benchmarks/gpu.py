@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments.benchmarks.bench import check_out
 from srl_jax.config import versions
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
+
+from .. import flags as config_flags
+from .bench import check_out
 
 FLAGS = flags.FLAGS
 NATURE, JOINT = "thesis/rl_only_nature", "thesis/joint_256"
@@ -47,8 +48,9 @@ def updates(preset: str, repeats: int, seeds: int = 1) -> list[float]:
     """Milliseconds of a preset's updates, of so many seeds in one call."""
     import jax
 
-    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, frame_shape, random_window
     from srl_jax.agent import make_agent, over_seeds
+
+    from .jax_side import NUM_ACTIONS, config_of, frame_shape, random_window
 
     config = config_of(preset)
     agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
@@ -67,8 +69,9 @@ def updates(preset: str, repeats: int, seeds: int = 1) -> list[float]:
 
 def whole_run(seconds: float) -> dict[str, float]:
     """Projects 5M env steps of Pong from a stretch of the loop and one evaluation."""
-    from experiments.benchmarks.jax_side import config_of
     from srl_jax.loop import Run
+
+    from .jax_side import config_of
 
     config = config_of(NATURE)
     with tempfile.TemporaryDirectory() as out:

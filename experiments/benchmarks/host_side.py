@@ -12,9 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from experiments import runtime
-from experiments.benchmarks.worker import serve
 from srl_jax.config import versions
+
+from .. import runtime
+from .worker import serve
 
 WARM_UPDATES = 5
 """Updates of the loop before anything is timed."""
@@ -37,8 +38,9 @@ class Loop:
 
     def setup(self, preset: str) -> dict[str, Any]:
         """Builds the run, and takes it past its first updates. Replies with "versions"."""
-        from experiments.benchmarks.jax_side import config_of
         from srl_jax import loop
+
+        from .jax_side import config_of
 
         self._acting = []
         self._run = loop.Run([config_of(preset)], [Path()])

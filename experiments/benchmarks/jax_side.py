@@ -13,11 +13,12 @@ from unittest import mock
 
 import numpy as np
 
-from experiments import runtime
-from experiments.benchmarks.worker import serve
-from experiments.presets import PRESETS
 from srl_jax.config import Config, resolve, versions
 from srl_jax.types import TrainState, Window
+
+from .. import runtime
+from ..presets import PRESETS
+from .worker import serve
 
 NUM_ACTIONS = 6
 """Pong's."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import runtime
+from .. import runtime
 
 PRESETS = ("thesis/rl_only_nature", "thesis/rl_only_256", "thesis/joint_256")
 ROUNDS = 15
@@ -32,8 +32,9 @@ def update_cost(preset: str) -> Cost:
     """Counts a preset's update: XLA's count of operations before it optimises, and passes over parameters."""
     import jax
 
-    from experiments.benchmarks.jax_side import NUM_ACTIONS, config_of, frame_shape, random_window
     from srl_jax.agent import make_agent
+
+    from .jax_side import NUM_ACTIONS, config_of, frame_shape, random_window
 
     config = config_of(preset)
     agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
@@ -82,7 +83,7 @@ def rates() -> dict[str, float]:
 
 def main() -> None:
     """Prints the rates, and each preset's floor and time."""
-    from experiments.benchmarks.jax_side import Updates
+    from .jax_side import Updates
 
     found = rates()
     print(

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.benchmarks.table import Goal
+from .table import Goal
 
 
 class Side(NamedTuple):

@@ -10,8 +10,8 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from experiments.benchmarks.rows import ARMS, CHECK_UPDATES, SERIES, Row, Side, series_of
-from experiments.benchmarks.worker import Worker
+from .rows import ARMS, CHECK_UPDATES, SERIES, Row, Side, series_of
+from .worker import Worker
 
 TOLERANCE = 1e-4
 """Largest relative difference of two losses that count as equal."""

@@ -6,8 +6,8 @@
 import functools
 import os
 
-from experiments import flags as config_flags
-from experiments import runtime, train
+from .. import flags as config_flags
+from .. import runtime, train
 
 MARK = "first update done"
 """The line that is printed."""

@@ -31,7 +31,7 @@ from tianshou.env.atari.atari_network import RainbowNet
 from tianshou.env.atari.atari_wrapper import wrap_deepmind
 from tianshou.utils.torch_utils import policy_within_training_step
 
-from experiments.benchmarks.worker import serve
+from .worker import serve
 
 STACK = 4  # frames
 MAX_FRAMES = 108_000  # of an episode

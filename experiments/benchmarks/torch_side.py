@@ -18,7 +18,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from experiments.benchmarks.worker import serve
+from .worker import serve
 
 INPUT_GAIN = 32.0  # the presets' option gain
 N_STEP = 3

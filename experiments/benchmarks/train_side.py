@@ -11,8 +11,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from experiments.benchmarks.startup import MARK
-from experiments.benchmarks.worker import ROOT, serve
+from .startup import MARK
+from .worker import ROOT, serve
 
 STEPS = 105_000
 """Env steps of the run whose memory is measured; its buffer is then full."""

@@ -20,8 +20,9 @@ from typing import Any, NamedTuple
 
 from absl import flags
 
-from experiments import flags as config_flags
 from srl_jax.errors import ConfigError
+
+from .. import flags as config_flags
 
 FLAGS = flags.FLAGS
 WIDTHS = {"desktop": 1280, "phone": 390}

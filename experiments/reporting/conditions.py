@@ -1,8 +1,8 @@
 """The end of a report: what the arms cost, how they differ, how they were evaluated."""
 
-from experiments.reporting import configs, numbers
-from experiments.reporting.contents import Content, Report
-from experiments.reporting.markup import details, duration, listed, number, plural, table, tag
+from . import configs, numbers
+from .contents import Content, Report
+from .markup import details, duration, listed, number, plural, table, tag
 
 
 def cost(report: Report) -> Content:

@@ -5,13 +5,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments import collect
-from experiments.collect import RunData
 from srl_jax import specs
 from srl_jax.config import INFOS, Config, history
 from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
+
+from .. import collect
+from ..collect import RunData
 
 SPECIFICATIONS = ("rl", "encoder", "objectives")
 """Fields that are name:key=value,..., shown option by option."""
@@ -118,6 +119,8 @@ def _fields(config: Config) -> dict[str, str]:
             continue
         if field in SPECIFICATIONS:
             found |= _options(field, value)
+        elif field == "imports":
+            found[field] = ", ".join(Path(text).name for text in value) or "none"
         elif value and field in collect.OF_A_SEED:
             found[field] = source_name(value)
         else:

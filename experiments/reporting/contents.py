@@ -7,12 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import collect
-from experiments.collect import RunData
-from experiments.colours import Style, styles
-from experiments.reporting.markup import Markup, number
-from experiments.reporting.numbers import Comparison, Row
 from srl_jax.statistics import NARROW, Interval
+
+from .. import collect
+from ..collect import RunData
+from ..colours import Style, styles
+from .markup import Markup, number
+from .numbers import Comparison, Row
 
 Content = Markup | list | None
 """Of a section; None for none."""

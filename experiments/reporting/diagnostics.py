@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import collect, plots
-from experiments.collect import RunData
-from experiments.colours import Style
-from experiments.reporting import pictures
-from experiments.reporting.numbers import numbers_of
-from experiments.reporting.pictures import Picture
+from .. import collect, plots
+from ..collect import RunData
+from ..colours import Style
+from . import pictures
+from .numbers import numbers_of
+from .pictures import Picture
 
 LISTS_OVER = "diag/drift/steps"
 """The env steps of the kept encoders: what lists are over, and nothing to draw."""

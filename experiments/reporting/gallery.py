@@ -8,16 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from experiments import collect, diagnostic_plots, plots
-from experiments.collect import RunData
-from experiments.directories import natural
-from experiments.reporting import diagnostics, numbers, pictures
-from experiments.reporting.contents import Content, Report, run_name
-from experiments.reporting.markup import Markup, breakable, details, figure, listed, plural, tag
 from srl_jax import statistics
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
+
+from .. import collect, diagnostic_plots, plots
+from ..collect import RunData
+from ..directories import natural
+from . import diagnostics, numbers, pictures
+from .contents import Content, Report, run_name
+from .markup import Markup, breakable, details, figure, listed, plural, tag
 
 MEDIA_BYTES = 5_000_000
 """Of pictures taken from the runs, in all; base64 adds a third."""

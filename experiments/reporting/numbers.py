@@ -10,15 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments import collect
-from experiments.collect import RunData, has_policy
-from experiments.directories import natural
-from experiments.presets import PRESETS
-from experiments.reporting import configs
 from srl_jax import statistics
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.specs import LIMITS
+
+from .. import collect
+from ..collect import RunData, has_policy
+from ..directories import natural
+from ..presets import PRESETS
+from . import configs
 
 NEVER = 1e18
 """Env steps that stand for never, where a median is drawn again."""

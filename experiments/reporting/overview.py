@@ -4,10 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from experiments import collect
-from experiments.reporting import configs, numbers, pictures
-from experiments.reporting.configs import About
-from experiments.reporting.contents import (
+from srl_jax.data import reference_policies
+from srl_jax.statistics import BOOTSTRAP, ENOUGH, NARROW, WELCH, Interval
+
+from .. import collect
+from . import configs, numbers, pictures
+from .configs import About
+from .contents import (
     Content,
     Report,
     difference_text,
@@ -16,11 +19,9 @@ from experiments.reporting.contents import (
     run_name,
     side,
 )
-from experiments.reporting.markup import Markup, details, figure, listed, number, plural, table, tag
-from experiments.reporting.numbers import Row
-from experiments.reporting.tables import interval_of, summary_of
-from srl_jax.data import reference_policies
-from srl_jax.statistics import BOOTSTRAP, ENOUGH, NARROW, WELCH, Interval
+from .markup import Markup, details, figure, listed, number, plural, table, tag
+from .numbers import Row
+from .tables import interval_of, summary_of
 
 TESTS = {WELCH: "Welch's t test at 5 %", BOOTSTRAP: "a 95 % bootstrap interval that leaves out 0"}
 """What it is that an interval of this kind leaves out 0."""

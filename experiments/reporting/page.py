@@ -4,11 +4,12 @@ import importlib.resources
 from collections.abc import Mapping
 from pathlib import Path
 
-from experiments import collect
-from experiments.reporting import conditions, gallery, numbers, overview, tables
-from experiments.reporting.contents import Content, Report
-from experiments.reporting.markup import Markup, listed, plural, tag
 from srl_jax.errors import ConfigError
+
+from .. import collect
+from . import conditions, gallery, numbers, overview, tables
+from .contents import Content, Report
+from .markup import Markup, listed, plural, tag
 
 SECTIONS = (
     ("run", "What was run", overview.what_was_run),

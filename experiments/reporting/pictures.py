@@ -10,11 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from experiments import plots
-from experiments.colours import Style
 from srl_jax import statistics
 from srl_jax.errors import ConfigError
 from srl_jax.reading import read_bytes
+
+from .. import plots
+from ..colours import Style
 
 LARGEST = 1 << 24
 """Bytes that a picture on disk may have."""

@@ -5,13 +5,14 @@ from typing import Any
 
 import numpy as np
 
-from experiments.reporting import numbers
-from experiments.reporting.contents import Content, Report, limits, side, signed
-from experiments.reporting.markup import Markup, details, number, plural, table, tag
-from experiments.reporting.numbers import Comparison, Row
 from srl_jax import statistics
 from srl_jax.data import POLICIES, Published, ReferencePolicy, published, reference_policies
 from srl_jax.statistics import NARROW, Interval
+
+from . import numbers
+from .contents import Content, Report, limits, side, signed
+from .markup import Markup, details, number, plural, table, tag
+from .numbers import Comparison, Row
 
 NEAR = 2.5
 """Published results of up to so many times as many env steps, or as few, are shown at once."""

@@ -1,4 +1,4 @@
-"""The parts of `experiments.soak`: each tries to break one promise, and counts."""
+"""`python -m experiments.soaking`; its parts: each tries to break one promise, and counts."""
 
 from collections.abc import Callable
 from pathlib import Path

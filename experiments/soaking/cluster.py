@@ -13,9 +13,9 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.flags import last_of_each
-from experiments.soaking import Count, Say, sweeps
-from experiments.sweeping import manifest, states
+from ..flags import last_of_each
+from ..sweeping import manifest, states
+from . import Count, Say, sweeps
 
 SWEEP = ("--presets=small/frozen_256,small/joint_256,small/rl_only_256", "--seeds=2", *sweeps.SMALL)
 """Ten runs."""

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.soaking import Count, Say
+from . import Count, Say
 
 EVERY = 50_000
 SHARE, SECONDS = 0.02, 30.0
@@ -19,9 +19,10 @@ SHARE, SECONDS = 0.02, 30.0
 
 def soak(short: bool, folder: Path, say: Say) -> list[Count]:
     """See the module."""
-    from experiments.benchmarks.jax_side import config_of
     from srl_jax import checkpoint
     from srl_jax.loop import Run
+
+    from ..benchmarks.jax_side import config_of
 
     preset = config_of("thesis/rl_only_nature")
     every = 600 if short else EVERY

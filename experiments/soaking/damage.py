@@ -8,10 +8,11 @@ import random
 import shutil
 from pathlib import Path
 
-from experiments.soaking import Count, Say
-from experiments.soaking.small import stopped_run
 from srl_jax import checkpoint
 from srl_jax.errors import ConfigError
+
+from . import Count, Say
+from .small import stopped_run
 
 BITS = 1000
 

@@ -13,10 +13,11 @@ import subprocess
 from pathlib import Path
 from unittest import mock
 
-from experiments.soaking import Count, Say, kills
-from experiments.soaking.small import stopped_run
 from srl_jax import checkpoint, replay
 from srl_jax.errors import ConfigError, SaveError
+
+from . import Count, Say, kills
+from .small import stopped_run
 
 STEPS_BETWEEN = 30
 """Env steps between two saves."""

@@ -13,8 +13,6 @@ import gymnasium
 import numpy as np
 from gymnasium.wrappers import AtariPreprocessing
 
-from experiments.soaking import Count, Say
-from experiments.soaking.snapshots import NOOP_MAX, Lines, out_of_snapshots
 from srl_jax import envs, loop
 from srl_jax.actor import seed_for
 from srl_jax.agent import make_agent
@@ -23,6 +21,9 @@ from srl_jax.envs.atari import COUNTERS
 from srl_jax.loop import Run
 from srl_jax.progress import Progress
 from srl_jax.types import Window
+
+from . import Count, Say
+from .snapshots import NOOP_MAX, Lines, out_of_snapshots
 
 TWISTER = np.random.RandomState
 """A Mersenne twister that is seeded as C++'s mt19937 is."""

@@ -17,10 +17,11 @@ import time
 from collections import Counter
 from pathlib import Path
 
-from experiments.flags import last_of_each
-from experiments.soaking import Count, Say
-from experiments.soaking.victim import POINTS
 from srl_jax.metrics import read_metrics, strip_wall
+
+from ..flags import last_of_each
+from . import Count, Say
+from .victim import POINTS
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -14,9 +14,10 @@ from types import SimpleNamespace
 
 import numpy as np
 
-from experiments.soaking import Count, Say
-from experiments.soaking.replay_reference import EVENTS, STEP, Driver
 from srl_jax.specs import ConfigError
+
+from . import Count, Say
+from .replay_reference import EVENTS, STEP, Driver
 
 OPERATIONS, SHORT = 1_000_000, 2_000
 """To be done at least; a step of all streams, begin, sample, set_priorities and restore count one each."""

@@ -15,8 +15,8 @@ from typing import NamedTuple
 
 from absl import flags
 
-from experiments.soaking import Count, Say
-from experiments.soaking.malformed_cases import (
+from . import Count, Say
+from .malformed_cases import (
     ARRAYS,
     CANARY,
     FLAGS,
@@ -220,9 +220,10 @@ def execute(program: str, arguments: Iterable[str], folder: Path) -> Outcome:
 
 def call(program: str, arguments: Iterable[str], folder: Path) -> Outcome:
     """Runs `train` in this process, with flags of its own; another program is not known here."""
-    from experiments import flags as config_flags
-    from experiments import train
     from srl_jax.specs import ConfigError
+
+    from .. import flags as config_flags
+    from .. import train
 
     if program != "train":
         raise ValueError(f"{program} runs in a process of its own only")

@@ -17,10 +17,11 @@ from unittest import mock
 
 import numpy as np
 
-from experiments.flags import RL_OPTIONS, last_of_each
 from srl_jax import checkpoint
 from srl_jax.config import INFOS, Config
 from srl_jax.specs import Info
+
+from ..flags import MOVED, last_of_each
 
 FLAGS, PRESETS, SPECS = "flags", "presets", "objectives and other specs"
 TOGETHER, MANIFESTS, CONFIGS = "flags that contradict each other", "manifests", "configs and metrics"
@@ -79,9 +80,10 @@ def make_valid_run(run: Path) -> None:
     """A run directory as training leaves it: config.json, metrics.jsonl and one checkpoint, of zeros."""
     import jax
 
-    from experiments.train import resolved
     from srl_jax.agent import make_agent
     from srl_jax.metrics import MetricsWriter
+
+    from ..train import resolved
 
     config = resolved(Config(**SETTINGS))
     run.mkdir(parents=True)
@@ -321,7 +323,6 @@ def typed(number: float) -> str:
 
 def _flags() -> Iterator[Case]:
     infos = {info.flag or name: info for name, info in INFOS.items()}
-    infos |= {name: info for name, (_, info) in RL_OPTIONS.items()}
     infos["tune_runtime"] = Info(str, "", choices=("auto", "off"))
     for flag, info in infos.items():
         for what, text in _wrong(info):
@@ -330,6 +331,7 @@ def _flags() -> Iterator[Case]:
         "misspelled": ("--gane=Pong", "--gane"),
         "unknown": ("--frobnicate=1", "--frobnicate"),
         "dunder": ("--__class__=1", "--__class__"),
+        **{f"of before: {flag}": (f"--{flag}=1", f"--{flag}") for flag in MOVED},
         "code": (f"--{CODE}", CODE[:20]),
         "no value": ("--steps", "steps"),
         "one dash": ("-steps=abc", "--steps"),
@@ -520,7 +522,7 @@ def _together() -> Iterator[Case]:
         "a buffer without room for a window": (
             *("--batch_size=1", "--learn_start=0", "--buffer_size=50", "--num_envs=10", "--buffer_size=50"),
         ),
-        "a return longer than the buffer": ("--n_step=20000", "--buffer_size=1000", "n_step"),
+        "a return longer than the buffer": ("--rl=:n_step=20000", "--buffer_size=1000", "n_step"),
         "too many environments for the buffer": ("--num_envs=10000", "--buffer_size=20000", "num_envs"),
         "a buffer larger than memory": ("--buffer_size=2000000000", "--buffer_size"),
         "frames that Catch does not know": ("--frame_size=50", "--frame_size=50"),
@@ -542,11 +544,10 @@ def _together() -> Iterator[Case]:
             *("--mode=pretrain", "--objective=inverse", "--srl_every=2", "--srl_every"),
         ),
         "seed and seeds": ("--seed=1", "--seeds=1,2", "--seeds"),
-        "an option twice, differently": ("--rl=rainbow:n_step=1", "--n_step=3", "--n_step"),
         "an option that the algorithm lacks": ("--rl=rainbow:n_stp=1", "--rl"),
-        "atoms the wrong way round": ("--v_min=1", "--v_max=0", "v_m"),
-        "one atom": ("--num_atoms=1", "--num_atoms"),
-        "an exponent above 1": ("--alpha=1.5", "alpha"),
+        "atoms the wrong way round": ("--rl=:v_min=1,v_max=0", "v_m"),
+        "one atom": ("--rl=:atoms=1", "atoms"),
+        "an exponent above 1": ("--rl=:alpha=1.5", "alpha"),
         "overwrite without out": ("--overwrite", "--out=", "--out"),
     }  # fmt: skip
     for name, (*arguments, names) in table.items():

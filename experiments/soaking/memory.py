@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 
-from experiments.soaking import Count, Say
-from experiments.soaking.small import config
+from . import Count, Say
+from .small import config
 
 ALLOWED = 6e6
 """Bytes that resident memory may have grown by, from a third of the run to its end: malloc wanders."""

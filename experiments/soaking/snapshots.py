@@ -4,9 +4,10 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from experiments.soaking import Count, Say
 from srl_jax import envs
 from srl_jax.progress import Progress
+
+from . import Count, Say
 
 NOOP_MAX = 30
 ODD_GAMES = ("Breakout", "Qbert", "YarsRevenge", "Seaquest", "Pong")

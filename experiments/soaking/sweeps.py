@@ -15,11 +15,12 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from experiments.flags import last_of_each
-from experiments.soaking import Count, Say
-from experiments.sweeping import manifest, states
 from srl_jax import checkpoint
 from srl_jax.metrics import read_metrics, strip_wall
+
+from ..flags import last_of_each
+from ..sweeping import manifest, states
+from . import Count, Say
 
 CHECKOUT = Path(__file__).resolve().parents[2]
 

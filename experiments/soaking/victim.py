@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import train
+from .. import flags as config_flags
+from .. import train
 
 
 def digest(run: Any) -> dict[str, str]:

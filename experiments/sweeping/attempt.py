@@ -8,10 +8,12 @@ import sys
 import time
 from pathlib import Path
 
-from experiments.sweeping import machine, states
-from experiments.sweeping.resolving import environment
-from experiments.sweeping.states import Record
 from srl_jax.errors import EXIT_STATUS, ConfigError, Diverged, SaveError
+
+from .. import PACKAGE
+from . import machine, states
+from .resolving import environment
+from .states import Record
 
 BAD_INPUT, NO_SPACE, DIVERGED = (EXIT_STATUS[kind] for kind in (ConfigError, SaveError, Diverged))
 
@@ -37,7 +39,7 @@ class Attempt:
         before = states.read_record(root, name)
         log = states.log_path(root, name)
         numbers = ",".join(map(str, self.cores.numbers))
-        watched = [sys.executable, "-m", "experiments.sweeping.child", str(os.getpid()), numbers, *command]
+        watched = [sys.executable, "-m", f"{PACKAGE}.sweeping.child", str(os.getpid()), numbers, *command]
         attempts = before.attempts + 1 if before else 1
         try:
             log.parent.mkdir(parents=True, exist_ok=True)

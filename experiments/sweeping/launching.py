@@ -9,11 +9,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
-from experiments.stopping import signals
-from experiments.sweeping import attempt, states
-from experiments.sweeping.manifest import Entry
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
+
+from ..stopping import signals
+from . import attempt, states
+from .manifest import Entry
 
 
 class Ended(NamedTuple):

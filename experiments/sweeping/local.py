@@ -3,11 +3,12 @@
 from collections.abc import Callable
 from pathlib import Path
 
-from experiments.sweeping import machine, plan, states
-from experiments.sweeping.attempt import Attempt
-from experiments.sweeping.launching import Ended
-from experiments.sweeping.manifest import Entry
 from srl_jax.config import Config
+
+from . import machine, plan, states
+from .attempt import Attempt
+from .launching import Ended
+from .manifest import Entry
 
 
 class Local:

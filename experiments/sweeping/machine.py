@@ -9,8 +9,9 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
-from experiments import control_groups, runtime
 from srl_jax.config import Config
+
+from .. import control_groups, runtime
 
 RUN_BYTES = 600 * 2**20
 """Of a process that trains, beside its replay buffer: measured with the thesis' encoders on a CPU."""

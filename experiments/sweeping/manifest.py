@@ -7,10 +7,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.sweeping.plan import Planned
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.reading import parse_json, read_bytes
+
+from .plan import Planned
 
 FILE = "sweep.json"
 FORMAT = 1

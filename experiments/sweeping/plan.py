@@ -1,16 +1,22 @@
 """What a sweep runs: a run for each arm, game and seed, and what these start from. Imports no jax."""
 
 import fnmatch
+import itertools
 import os
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from experiments.presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS
+from srl_jax import plugins
 from srl_jax.config import INFOS
 from srl_jax.envs import GAMES
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
+
+from .. import PACKAGE
+from ..flags import unknown
+from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, parts, preset_values, source_preset
 
 Flags = Mapping[str, str | tuple[str, ...]]
 """Flags of experiments.train as typed on the command line; a tuple's is repeated."""
@@ -25,6 +31,7 @@ OWN = {
     "game": "games",
     "seed": "seeds",
     "preset": "presets",
+    "config": "presets",
     "encoder_from": "presets",
     "policy_from": "presets",
 }
@@ -36,7 +43,7 @@ class Arm(NamedTuple):
 
     Attributes:
         name: of its runs' directories.
-        preset: a key of `experiments.presets.PRESETS`.
+        preset: as of `experiments.presets.preset_values`.
         flags: over the preset, for this arm alone.
     """
 
@@ -50,7 +57,7 @@ class Planned(NamedTuple):
 
     Attributes:
         name: GAME/ARM/seedN, also its directory under the sweep's root.
-        preset: a key of `experiments.presets.PRESETS`.
+        preset: as of `experiments.presets.preset_values`.
         flags: over the preset.
         encoder_from, policy_from: names of the runs that it starts from, or "".
     """
@@ -68,8 +75,40 @@ class Planned(NamedTuple):
 
 
 def arm_of(preset: str) -> Arm:
-    """The arm of a preset, with its name less its family's."""
-    return Arm(preset.rpartition("/")[2], preset)
+    """The arm of a preset, with its name less its family's: thesis/joint_256+small is joint_256_small."""
+    return Arm("_".join(part.rpartition("/")[2] for part in preset.split("+")), preset)
+
+
+def grid(arms: Sequence[Arm], texts: Sequence[str], flags: Flags) -> list[Arm]:
+    """The arms, each once with every combination of values.
+
+    Args:
+        arms: to vary.
+        texts: FLAG=VALUE,VALUE,... each; with ; between them values may have commas.
+        flags: for every run, given beside.
+
+    Raises:
+        ConfigError: one is not that, or no flag of training, or the flag is there already.
+    """
+    known = [info.flag or name for name, info in INFOS.items()]
+    axes: dict[str, list[str]] = {}
+    for text in texts:
+        flag, _, rest = text.partition("=")
+        values = [value.strip() for value in rest.split(";" if ";" in rest else ",")]
+        if not all((flag, *values)):
+            raise ConfigError(f"--grid={text}: must be FLAG=VALUE,VALUE, as in --grid=lr_rl=1e-4,3e-4")
+        if flag not in known:
+            raise ConfigError(f"--grid={text}: --{flag}: {unknown(flag, known)}")
+        if flag in axes or flag in flags:
+            raise ConfigError(f"--grid={text}: --{flag} is given beside it; give it once")
+        axes[flag] = values
+    found = []
+    for arm in arms:
+        for combination in itertools.product(*axes.values()):
+            own = dict(zip(axes, combination, strict=True))
+            parts = (f"{flag}={re.sub(r'[^A-Za-z0-9_.=-]+', '-', x.lstrip(':+'))}" for flag, x in own.items())
+            found.append(Arm("_".join((arm.name, *parts)), arm.preset, {**arm.flags, **own}))
+    return found
 
 
 def plan(
@@ -92,10 +131,11 @@ def plan(
     Raises:
         ConfigError: a name is unknown, or two runs would have the same one.
     """
-    flags = dict(flags or {})
+    flags = _checked("", flags or {})
     by_name: dict[str, Arm] = {}
     for arm in arms:
         _check(arm)
+        arm = arm._replace(flags=_checked(f"arm {arm.name}: ", arm.flags))
         if by_name.setdefault(arm.name, arm) != arm:
             raise ConfigError(
                 f"arm {arm.name}: there twice, of {by_name[arm.name].preset} and of {arm.preset}; "
@@ -104,20 +144,20 @@ def plan(
     for game in games:
         if game not in GAMES:
             raise ConfigError(f"--games={game}: {choices_text(game, GAMES)}")
-    _check_flags("", flags)
 
     runs: dict[str, Planned] = {}
 
     def add(arm: Arm, game: str, seed: int) -> str:
-        mode = arm.flags.get("mode", flags.get("mode", PRESETS[arm.preset]["mode"]))
+        mode = arm.flags.get("mode", flags.get("mode", preset_values(arm.preset)["mode"]))
         own = {**flags, **arm.flags}
         if mode == "pretrain" and "steps" in flags and "steps" not in arm.flags:
             own["steps"] = _pretraining(flags["steps"])
         sources = {}
         for flag, table in SOURCES.items():
             # A preset's source is asked for while its mode is, as on the command line of a single run.
-            if arm.preset in table and mode == PRESETS[arm.preset]["mode"]:
-                source = arm_of(table[arm.preset])
+            preset = source_preset(arm.preset, table)
+            if preset and mode == preset_values(arm.preset.partition("+")[0])["mode"]:
+                source = arm_of(preset)
                 named = by_name.get(source.name, source)
                 if named.preset != source.preset:
                     raise ConfigError(
@@ -131,26 +171,33 @@ def plan(
 
     for seed in seeds:
         for arm in by_name.values():
-            for game in games or [PRESETS[arm.preset]["game"]]:
+            for game in games or [preset_values(arm.preset)["game"]]:
                 add(arm, game, seed)
     return list(runs.values())
 
 
 def _check(arm: Arm) -> None:
-    if arm.preset not in PRESETS:
-        raise ConfigError(f"arm {arm.name}: {arm.preset}: {choices_text(arm.preset, PRESETS)}")
+    try:
+        parts(arm.preset)
+    except ConfigError as error:
+        raise ConfigError(f"arm {arm.name}: {error}") from None
     plain = arm.name.replace("_", "").replace("-", "").replace(".", "").replace("=", "")
     if not (plain.isascii() and plain.isalnum()) or arm.name.startswith("."):
         raise ConfigError(f"arm {arm.name}: a name is made of letters, digits and _ - . =")
     if ".broken-" in arm.name:
         raise ConfigError(f"arm {arm.name}: .broken- marks what was moved aside; give it another name")
-    _check_flags(f"arm {arm.name}: ", arm.flags)
 
 
-def _check_flags(where: str, flags: Flags) -> None:
+def _checked(where: str, flags: Flags) -> dict[str, str | tuple[str, ...]]:
+    """The flags, with the files that they import named so that a process finds them that works elsewhere."""
     for flag, mine in OWN.items():
         if flag in flags:
             raise ConfigError(f"{where}--{flag}: a sweep gives it to each run; --{mine} decides it")
+    own = dict(flags)
+    if "import" in own:
+        texts = (own["import"],) if isinstance(own["import"], str) else own["import"]
+        own["import"] = tuple(text if text == "none" else plugins.located(text) for text in texts)
+    return own
 
 
 def _pretraining(steps: str | tuple[str, ...]) -> str:
@@ -161,15 +208,19 @@ def _pretraining(steps: str | tuple[str, ...]) -> str:
 
 
 def presets(patterns: Sequence[str]) -> list[str]:
-    """The presets that match any of the patterns, as in thesis/*, in the order of the table.
+    """The presets that match the patterns, as in thesis/* or thesis/*+small, in the order of the table.
 
     Raises:
         ConfigError: a pattern matches none.
     """
-    for pattern in patterns:
-        if not fnmatch.filter(PRESETS, pattern):
-            raise ConfigError(f"--presets={pattern}: {choices_text(pattern, PRESETS)}")
-    return [name for name in PRESETS if any(fnmatch.fnmatchcase(name, pattern) for pattern in patterns)]
+    found: dict[str, list[str]] = {}
+    for text in patterns:
+        pattern, plus, pieces = text.partition("+")
+        matching = fnmatch.filter(PRESETS, pattern)
+        if not matching:
+            raise ConfigError(f"--presets={text}: {choices_text(pattern, PRESETS)}")
+        found.setdefault(plus + pieces, []).extend(matching)
+    return [name + pieces for pieces, names in found.items() for name in PRESETS if name in names]
 
 
 def parse_seeds(text: str, flag: str = "seeds") -> list[int]:
@@ -209,7 +260,7 @@ def command(run: Planned, root: str | os.PathLike = "") -> list[str]:
         root: the sweep's; empty for a process that works there. Launchers do that: config.json then names
             what a run starts from as it lies under the root, wherever that is.
     """
-    found = [sys.executable, "-m", "experiments.train", *settings(run)]
+    found = [sys.executable, "-m", f"{PACKAGE}.train", *settings(run)]
     for flag in SOURCES:
         if source := getattr(run, flag):
             found.append(f"--{flag}={os.path.join(root, source)}")

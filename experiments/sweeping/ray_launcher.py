@@ -18,13 +18,14 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from experiments.sweeping import attempt, machine, manifest, plan, states
-from experiments.sweeping.launching import Ended
-from experiments.sweeping.manifest import Entry
-from experiments.sweeping.resolving import CHECKOUT
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.reading import read_bytes
+
+from . import attempt, machine, manifest, plan, states
+from .launching import Ended
+from .manifest import Entry
+from .resolving import INSTALLED
 
 PATIENCE_S = 600.0
 """How long a task waits for another process to leave its run's directory, in seconds."""
@@ -119,7 +120,7 @@ class Ray:
     def start(self, entry: Entry) -> None:
         run, config = entry
         texts = str(self.root), run.name, self.command(run), config.to_json(), str(self.stop_file)
-        self.flying[self.task.remote(str(CHECKOUT), *texts, self.cpus, self.gpus)] = run.name
+        self.flying[self.task.remote(str(INSTALLED), __name__, *texts, self.cpus, self.gpus)] = run.name
 
     def ended(self) -> list[Ended]:
         if not self.flying:
@@ -167,14 +168,13 @@ def _check_address(address: str | None) -> None:
 def _task() -> Callable[..., dict]:
     """What a worker executes. Made in a function, so that its code travels and the worker can find ours."""
 
-    def attempt_run(checkout: str, *arguments: Any) -> dict:
+    def attempt_run(path: str, module: str, *arguments: Any) -> dict:
+        import importlib
         import sys
 
-        if checkout not in sys.path:
-            sys.path.insert(0, checkout)
-        from experiments.sweeping.ray_launcher import run_here
-
-        return run_here(*arguments)
+        if path not in sys.path:
+            sys.path.insert(0, path)
+        return importlib.import_module(module).run_here(*arguments)
 
     return attempt_run
 

@@ -13,19 +13,22 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments.sweeping.manifest import planned
-from experiments.sweeping.plan import Planned, settings
+import srl_jax
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 
-CHECKOUT = Path(__file__).resolve().parents[2]
-"""What PYTHONPATH has to name for a process that works elsewhere."""
+from .. import PACKAGE
+from .. import flags as config_flags
+from .manifest import planned
+from .plan import Planned, settings
+
+INSTALLED = Path(srl_jax.__file__).resolve().parents[1]
+"""Where the package lies; PYTHONPATH names it for processes that work elsewhere."""
 
 
 def environment() -> dict[str, str]:
     """Of a process that works in another directory, from which it shall import nothing."""
-    paths = [str(CHECKOUT), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    paths = [str(INSTALLED), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)), "PYTHONSAFEPATH": "1"}
 
 
@@ -36,7 +39,7 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Config]:
         ConfigError: a run's flags are not valid, or it cannot start from the runs that it names.
     """
     done = subprocess.run(
-        [sys.executable, "-m", "experiments.sweeping.resolving"],
+        [sys.executable, "-m", f"{PACKAGE}.sweeping.resolving"],
         input=json.dumps([run._asdict() for run in runs]),
         capture_output=True,
         text=True,
@@ -56,7 +59,7 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Config]:
 
 def resolve_here(runs: Sequence[Planned]) -> dict[str, Config]:
     """`resolve` in this process; imports jax."""
-    from experiments.train import check_extras, resolved
+    from ..train import check_extras, resolved
 
     configs: dict[str, Config] = {}
     known: dict[Config, Config] = {}  # what differs by the seed alone is resolved once
@@ -87,6 +90,8 @@ def parsed(run: Planned) -> Config:
     sources = [f"--{f}={getattr(run, f)}" for f in ("encoder_from", "policy_from") if getattr(run, f)]
     try:
         values([run.name, *settings(run), *sources])
+    except flags.UnrecognizedFlagError as error:
+        raise ConfigError(f"--{error.flagname}: {config_flags.unknown(error.flagname, values)}") from None
     except (flags.Error, ValueError) as error:
         raise ConfigError(str(error).removeprefix("flag ")) from None
     return config_flags.config_from_flags(values)

@@ -11,10 +11,11 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from experiments.directories import runs_below
-from experiments.sweeping.manifest import Entry
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+
+from ..directories import runs_below
+from .manifest import Entry
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 """Runs that the project has published."""

@@ -11,14 +11,15 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from experiments import directories
-from experiments.sweeping import manifest as manifests
 from srl_jax import checkpoint, rundir
 from srl_jax.checkpoint import NUMBERS, PARAMS
-from srl_jax.config import Config, another_run, difference
+from srl_jax.config import INFOS, Config, another_run, difference
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import Mark
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
+
+from .. import directories
+from . import manifest as manifests
 
 
 class State(NamedTuple):
@@ -104,7 +105,8 @@ def _config_problem(path: Path, config: Config) -> str:
             return "config.json: not a JSON object"
     except (OSError, ValueError) as error:
         return f"config.json: {getattr(error, 'strerror', None) or error}"
-    if differing := difference(Config.load(path), config):
+    names = [name for name in INFOS if name != "imports"]  # which may lie elsewhere by now
+    if differing := difference(Config.load(path), config, names):
         raise ConfigError(
             f"{path}: the run there has another configuration: {differing}; give the flags that it was run "
             "with, another --out, or move it away"

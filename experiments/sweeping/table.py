@@ -8,14 +8,15 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TextIO
 
-from experiments.sweeping import states
-from experiments.sweeping.launching import View
-from experiments.sweeping.manifest import Entry
-from experiments.sweeping.speed import Progress, Speeds, progress, seconds_left
 from srl_jax import checkpoint, ending, rundir
 from srl_jax.display import Display
 from srl_jax.errors import ConfigError
 from srl_jax.progress import hms
+
+from . import states
+from .launching import View
+from .manifest import Entry
+from .speed import Progress, Speeds, progress, seconds_left
 
 MOST = 12
 """Failed runs that are listed; the others are counted."""

@@ -8,10 +8,11 @@ decoder that mirrors it, and all have the options `init`, `zero_sum`, `gain` and
 from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder
 from srl_jax.encoders.impala import impala
+from srl_jax.plugins import Registry
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
-__all__ = ["REGISTRY", "flax_encoder", "impala", "nature", "sac_ae", "tiny"]
+__all__ = ["REGISTRY", "register", "flax_encoder", "impala", "nature", "sac_ae", "tiny"]
 
 
 def nature(
@@ -79,4 +80,5 @@ def tiny(
     return convolutional_encoder(observation_shape, layers, start, features=features)
 
 
-REGISTRY = {"nature": nature, "sac_ae": sac_ae, "tiny": tiny, "impala": impala}
+REGISTRY = Registry("encoders", {"nature": nature, "sac_ae": sac_ae, "tiny": tiny, "impala": impala})
+register = REGISTRY.register

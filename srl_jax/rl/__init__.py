@@ -8,13 +8,14 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 
+from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.losses import n_step as n_step_view
 from srl_jax.rl.values import Values, categorical, normal_logits, quantile, scalar
 from srl_jax.specs import check_size, option_defaults
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 
-__all__ = ["REGISTRY", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
+__all__ = ["REGISTRY", "register", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
 
 
 class QFunction(Protocol):
@@ -179,10 +180,14 @@ def q_learner_of(kind: Callable[..., Values], **defaults: Any) -> Callable[..., 
     return partial(row, **defaults)
 
 
-REGISTRY = {
-    "rainbow": rainbow,
-    "c51": q_learner_of(categorical),
-    "qr_dqn": q_learner_of(quantile),
-    "double": q_learner_of(scalar, double=True),
-    "dqn": q_learner_of(scalar),
-}
+REGISTRY = Registry(
+    "rl",
+    {
+        "rainbow": rainbow,
+        "c51": q_learner_of(categorical),
+        "qr_dqn": q_learner_of(quantile),
+        "double": q_learner_of(scalar, double=True),
+        "dqn": q_learner_of(scalar),
+    },
+)
+register = REGISTRY.register

@@ -1,6 +1,6 @@
 """Tries to break what the project promises about runs that are killed, disks and inputs, and prints a table.
 
-`python -m experiments.soak --out=DIR` runs everything, 97 minutes on two cores; `--only=kills,damage` some
+`python -m experiments.soaking --out=DIR` runs everything, 97 minutes on two cores; `--only=kills,damage` some
 of it; `--short` the versions that the test suite runs. Exit status 1 if a promise did not hold.
 """
 
@@ -13,12 +13,13 @@ from typing import NamedTuple
 
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments.soaking import Count
 from srl_jax.config import git_revision
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text
+
+from .. import flags as config_flags
+from . import Count
 
 FLAGS = flags.FLAGS
 
@@ -129,7 +130,7 @@ def main(argv: list[str]) -> int:
                 f"--out={FLAGS.out}: has {part} already; name a new directory, or others with --only"
             )
     for part in parts:
-        soak = importlib.import_module(f"experiments.soaking.{part}").soak
+        soak = importlib.import_module(f"{__package__}.{part}").soak
         began, revision = time.monotonic(), git_revision()
         with tempfile.TemporaryDirectory(prefix=f"soak_{part}_") as folder:
             counts = soak(FLAGS.short, Path(folder), lambda line: print(line, flush=True))

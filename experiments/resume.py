@@ -1,0 +1,61 @@
+"""Goes on with a run that was stopped or killed: `python -m experiments.resume runs/x`.
+
+Its config.json has all settings. What training takes beside them may follow: --policy_from of a run that lies
+elsewhere by now, --import, --tune_runtime.
+"""
+
+import os
+import sys
+from pathlib import Path
+
+from srl_jax.errors import ConfigError
+
+from . import flags as config_flags
+from . import help, train
+from .directories import natural
+from .sweeping.manifest import FILE
+
+
+def command_line(run: str) -> list[str]:
+    """The flags of training that go on with a run, or with the seeds that one process trained.
+
+    Args:
+        run: its directory, or the one that holds theirs.
+
+    Raises:
+        ConfigError: it is neither.
+    """
+    path = Path(os.path.expanduser(run))
+    goes_on = [f"--out={run}", "--resume=auto"]
+    if (path / "config.json").is_file():
+        return [f"--config={path / 'config.json'}", *goes_on]
+    if (path / FILE).is_file():
+        raise ConfigError(f"{run}: a sweep, with which srl-jax sweep --out={run} goes on")
+    seeds = sorted((folder.parent.name for folder in path.glob("seed*/config.json")), key=natural)
+    if not seeds:
+        raise ConfigError(f"{run}: not a run directory (no config.json)")
+    numbers = ",".join(name.removeprefix("seed") for name in seeds)
+    return [f"--config={path / seeds[0] / 'config.json'}", f"--seeds={numbers}", *goes_on]
+
+
+def main(argv: list[str]) -> None:
+    """The entry point: becomes training with the flags of the run.
+
+    Args:
+        argv: the program's name, the run, and flags beside its own.
+    """
+    program, run, *beside = argv if len(argv) > 1 else [*argv, ""]
+    if not run or run.startswith("-"):
+        raise ConfigError("name a run directory first: srl-jax resume runs/NAME")
+    sys.argv[:] = [program, *command_line(run), *beside]
+    train.cli()
+
+
+def cli() -> None:
+    """Runs this entry point as a program."""
+    help.if_asked(sys.argv, __doc__)
+    config_flags.guarded(main)(sys.argv)
+
+
+if __name__ == "__main__":
+    cli()

@@ -1,0 +1,192 @@
+"""Rows of one's own in the registries: objectives, encoders, RL algorithms. Imports no jax.
+
+A file registers what it has when it is imported:
+
+    import srl_jax.objectives
+
+    @srl_jax.objectives.register("mine")
+    def mine(context, *, weight: float = 1.0): ...
+
+`--import=my_file.py --objective=mine` imports it, and so does a module's name, `--import=my_package.losses`.
+An installed package names its rows as entry points of the groups `srl_jax.objectives`, `srl_jax.encoders` and
+`srl_jax.rl`; those are looked up where a name is in no registry.
+"""
+
+import functools
+import importlib
+import importlib.metadata
+import importlib.util
+import os
+import sys
+import traceback
+import zlib
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from srl_jax.errors import ConfigError
+from srl_jax.specs import option_defaults
+
+
+class Registry(dict[str, Callable]):
+    """A registry, as of `srl_jax.specs`, to which others may add rows.
+
+    Args:
+        kind: of what it has rows, as its package is called: "objectives".
+        rows: the package's own.
+    """
+
+    def __init__(self, kind: str, rows: Mapping[str, Callable]):
+        super().__init__(rows)
+        self.kind = kind
+        self._origins: dict[str, str] = {}
+
+    def register(self, name: str, factory: Callable | None = None) -> Callable:
+        """Adds a row: `register("mine", factory)`, or `@register("mine")` above the factory.
+
+        Args:
+            name: as it is written in `name:key=value,...`.
+            factory: takes what the registry's other rows take; its keyword-only parameters, each with a
+                default, are the options.
+
+        Returns:
+            The factory.
+
+        Raises:
+            ConfigError: the name is no identifier or has a row already, or an option has no default.
+        """
+        if factory is None:
+            return functools.partial(self.register, name)
+        if not (isinstance(name, str) and name.isascii() and name.isidentifier()):
+            raise ConfigError(f"srl_jax.{self.kind} takes no row {name!r}: a name is letters, digits and _")
+        try:
+            option_defaults(factory)
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"srl_jax.{self.kind} takes no row {name!r}: {error}") from None
+        origin = _origin(factory)
+        # A module that is imported a second time, by another name, says the same again.
+        if super().__contains__(name) and self._origins.get(name) != origin:
+            whose = self._origins.get(name, "the package itself")
+            raise ConfigError(
+                f"{origin} registers {name!r} in srl_jax.{self.kind}, where {whose} has a row of that name; "
+                "choose another one"
+            )
+        self[name], self._origins[name] = factory, origin
+        return factory
+
+    def __contains__(self, name: object) -> bool:
+        """Whether there is such a row; looks for an entry point of that name where there is none.
+
+        Raises:
+            ConfigError: two packages have one, or it cannot be imported.
+        """
+        return super().__contains__(name) or (isinstance(name, str) and self._installed(name))
+
+    def _installed(self, name: str) -> bool:
+        group = f"srl_jax.{self.kind}"
+        found = {point.value: point for point in importlib.metadata.entry_points(group=group, name=name)}
+        if len(found) > 1:
+            raise ConfigError(f"{name!r} of {group} is in {' and in '.join(sorted(found))}; uninstall one")
+        for value, point in found.items():
+            try:
+                self.register(name, point.load())
+            except Exception as error:
+                raise ConfigError(
+                    f"{name!r} of {group}, the entry point {value}: {_reason(error)}"
+                ) from error
+        return bool(found)
+
+
+def located(text: str) -> str:
+    """What config.json keeps of a value of --import: a file's absolute path, or a module's name.
+
+    Args:
+        text: a path, which has a / or ends in .py; or the name of a file here, without .py; or a module's.
+
+    Raises:
+        ConfigError: there is no such file, or it is no Python file.
+    """
+    path = Path(os.path.abspath(os.path.expanduser(text)))
+    if not _is_path(text):
+        here = path.with_name(f"{path.name}.py")
+        return str(here) if here.is_file() else text
+    if path.suffix != ".py":
+        raise ConfigError(f"--import={text}: must be a file that ends in .py, or a module's name")
+    return str(_checked(str(path)))
+
+
+def load(imports: Iterable[str]) -> None:
+    """Imports files and modules, each once in a process.
+
+    Args:
+        imports: as `located` gives them.
+
+    Raises:
+        ConfigError: one is missing, lies in a run directory, or raises an error; one line that names it.
+    """
+    for text in imports:
+        if text not in _LOADED:
+            path = _checked(text) if _is_path(text) else None
+            try:
+                _import_file(path) if path else importlib.import_module(text)
+            except (Exception, SystemExit) as error:
+                raise ConfigError(f"--import={text}: {_reason(error, path)}") from error
+            _LOADED.add(text)
+
+
+_LOADED: set[str] = set()
+
+
+def _is_path(text: str) -> bool:
+    return "/" in text or os.sep in text or text.endswith(".py")
+
+
+def _checked(text: str) -> Path:
+    """The path of a file that may be imported.
+
+    Raises:
+        ConfigError: there is none, or it lies in a run directory, which may be somebody else's.
+    """
+    path = Path(text)
+    if not path.is_file():
+        raise ConfigError(f"--import={text}: no such file; --import=PATH says where it lies now")
+    for folder in path.resolve().parents:
+        if (folder / "config.json").exists() and (folder / "metrics.jsonl").exists():
+            raise ConfigError(
+                f"--import={text}: lies in a run directory, {folder}, from which nothing is imported; copy it"
+            )
+    return path
+
+
+def _import_file(path: Path) -> None:
+    # By a name that no other module has; what lies beside the file it may import.
+    name = f"srl_jax_import_{path.stem}_{zlib.crc32(os.fsencode(path)):08x}"
+    spec = importlib.util.spec_from_file_location(name, path)
+    module = importlib.util.module_from_spec(spec)
+    if str(path.parent) not in sys.path:
+        sys.path.append(str(path.parent))
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+
+
+def _reason(error: BaseException, path: Path | None = None) -> str:
+    """An error in a line, with the line of the file that it comes from."""
+    lines = [
+        frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
+    ]
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        lines = [error.lineno]
+    what = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+    return " ".join(f"{f'line {lines[-1]}: ' if lines else ''}{what}".split())
+
+
+def _origin(factory: Any) -> str:
+    """The file in which a factory is written, or its module where that is not known."""
+    while isinstance(factory, functools.partial):
+        factory = factory.func
+    code = getattr(factory, "__code__", None)
+    return code.co_filename if code else getattr(factory, "__module__", "") or repr(factory)

@@ -1,0 +1,72 @@
+"""experiments/help.py: what --help prints."""
+
+import subprocess
+import sys
+
+import pytest
+from absl import flags
+
+from experiments import help, sweep, train
+from experiments.cli import COMMANDS
+from experiments.presets import PIECES, PIECES_HELP, PRESETS
+from srl_jax import encoders, objectives, rl
+from srl_jax.config import INFOS
+
+
+def _text(module):
+    values = flags.FlagValues()
+    module.define_flags(values)
+    return help.text("Does a thing.", values)
+
+
+def test_every_flag_of_training_is_in_one_group():
+    names = " ".join(help.GROUPS.values()).split()
+    assert len(names) == len(set(names))
+    values = flags.FlagValues()
+    train.define_flags(values)
+    assert set(names) == set(values)
+    assert {info.flag or name for name, info in INFOS.items()} <= set(names)
+
+
+def test_a_flag_is_shown_with_its_default_unit_and_help():
+    page = _text(train)
+    assert page.startswith("Does a thing.\n\nRun:\n  --preset ")
+    assert "\n  --steps=5000000         length of the run [env steps]\n" in page
+    assert "\n  --[no]reward_clip       learn from the sign of the reward (default: yes)\n" in page
+    assert "repeat this option" not in page
+    assert max(map(len, page.split("\nPresets:\n")[0].splitlines())) <= 110
+
+
+def test_rows_and_their_options_are_listed_below_their_flag():
+    page = " ".join(_text(train).split())
+    for registry in (rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY):
+        for name in registry:
+            assert f" {name}:" in page
+    assert " inverse:weight=1.0,hidden=256 " in page
+    assert " sac_ae:features=256,layer_norm=true," in page
+    assert " double: rainbow:distributional=false,dueling=false,noisy=false," in page
+
+
+def test_every_preset_has_a_line():
+    lines = _text(train).split("\nPresets:\n")[1].splitlines()
+    names = [line.split()[0] for line in lines]
+    assert names == [
+        *(name for name in PRESETS if not name.startswith("small/")),
+        "small/NAME",
+        *(f"PRESET+{piece}" for piece in PIECES),
+    ]
+    assert PIECES_HELP.keys() == PIECES.keys()
+
+
+def test_a_programs_own_flags_come_first():
+    page = _text(sweep)
+    assert page.index("\nFlags:\n") < page.index("  --grid") < page.index("\nRun:\n")
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_ends_with_status_0(name):
+    done = subprocess.run(
+        [sys.executable, "-m", "srl_jax", name, "--help"], capture_output=True, text=True, timeout=120
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"`srl-jax {name}" in done.stdout.splitlines()[0] or name == "figures"
