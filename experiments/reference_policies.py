@@ -27,9 +27,9 @@ from absl import flags
 from experiments import flags as config_flags
 from experiments.stopping import signals
 from experiments.train import check_extras
+from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
-from srl_jax.envs import CATCH, GAMES
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import Progress, hms
 from srl_jax.specs import Info, choices_text, value_text
@@ -85,7 +85,7 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         )
     if played is None:
         return None
-    atari = config.game not in CATCH  # which knows neither sticky actions nor no-ops
+    known = envs.game(config.game).options
     return ReferencePolicy(
         config.game,
         policy,
@@ -93,8 +93,8 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         round(float(np.std(played.returns, ddof=1)), 6) if episodes > 1 else None,
         episodes,
         round(float(np.mean(played.lengths)), 3),
-        config.sticky_actions if atari else None,
-        config.noop_max if atari else None,
+        config.sticky_actions if "sticky_actions" in known else None,
+        config.noop_max if "noop_max" in known else None,
         config.eval_max_steps,
         _command(config, policy, episodes),
     )
@@ -184,7 +184,9 @@ def run(values: flags.FlagValues) -> int:
         ConfigError: the command line is not valid; nothing was written.
         SaveError: the file cannot be written.
     """
-    games = _chosen("games", values["games"].value, tuple(GAMES))
+    games = envs.several(values["games"].value)
+    if not games:
+        raise ConfigError("--games: names none; give Catch or Pong, say")
     policies = _chosen("policies", values["policies"].value, POLICIES)
     episodes, out = values["episodes"].value, values["out"].value
     given: Mapping[str, Any] = {name: values[name].value for name in (*PROTOCOL, "seed")}

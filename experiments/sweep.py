@@ -22,7 +22,7 @@ from experiments.sweeping import launching, local, machine, manifest, plan, reso
 from experiments.sweeping.launching import Launcher, Outcome
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
-from srl_jax import display, rundir
+from srl_jax import display, envs, rundir
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import hms
@@ -266,7 +266,7 @@ def chosen_runs(values: flags.FlagValues, root: Path) -> list[Planned]:
     if values["presets"].value:
         arms = [plan.arm_of(preset) for preset in plan.presets(values["presets"].value)]
         seeds = plan.parse_seeds(values["seeds"].value)
-        return plan.plan(arms, values["games"].value or [], seeds, given)
+        return plan.plan(arms, envs.several(values["games"].value or []), seeds, given)
     entries = manifest.read(root)
     if not entries:
         raise ConfigError("--presets: missing; name some, as in --presets=thesis/joint_256,thesis/rl_only_*")

@@ -20,7 +20,7 @@ from experiments import flags as config_flags
 from experiments import runtime
 from experiments.directories import all_to_resume, check_out, going_on, run_directory, say_anew
 from experiments.stopping import signals
-from srl_jax import display
+from srl_jax import display, envs
 from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.rundir import check_free
@@ -77,16 +77,15 @@ def check_seeds(values: flags.FlagValues) -> list[int]:
 
 
 def check_extras(config: Config) -> None:
-    """Whether the optional packages that the run needs are installed.
+    """Whether the run's environments can be made here, and the optional packages that it needs are installed.
 
     Raises:
-        ConfigError: one is not; the line says which extra has it.
+        ConfigError: they cannot; the line says why, or which extra has the package.
     """
-    if not config.game.startswith("Catch") and importlib.util.find_spec("ale_py") is None:
-        raise ConfigError(
-            f"--game={config.game}: Atari needs ale-py, pip install 'srl-jax[atari]'; "
-            "valid without it: Catch, CatchDistractor"
-        )
+    try:
+        envs.game(config.game).check()
+    except ConfigError as error:
+        raise ConfigError(f"--game={config.game}: {error}") from None
     if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
         raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 from experiments.directories import runs_below
 from experiments.sweeping.manifest import Entry
+from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 
@@ -83,8 +84,7 @@ def progress(run: Path, tail: int = TAIL) -> Progress:
 
 def keys(config: Config) -> tuple[tuple, tuple]:
     """What makes runs about as fast as each other: strictly, and where there is nothing better."""
-    kind = "Catch" if config.game.startswith("Catch") else "Atari"
-    loose = kind, config.encoder, config.mode
+    loose = envs.game(config.game).kind, config.encoder, config.mode
     return (*loose, config.batch_size, config.updates_per_step, config.srl_every, config.frame_size), loose
 
 
