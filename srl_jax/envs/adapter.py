@@ -30,8 +30,8 @@ class Adapter(FrameVectorEnv):
 
     Snapshots hold the number of the episode, which gives the seed of its reset, and its actions so far;
     `restore` takes the same actions again, which takes as long as they took, and compares the frames. Where
-    they differ, it says that the environment is not deterministic: a run cannot be resumed from there. The log
-    of an episode that never ends grows without end; `max_steps` ends it.
+    they differ, it says that the environment is not deterministic: a run cannot be resumed from there. The
+    log of an episode that never ends grows without end; `max_steps` ends it.
 
     `info` holds `life_lost` bool [N], always False. An environment may tell its true state, which probes are
     fitted to: an attribute `state_names`, the names of the V numbers in `info["state"]` of its reset and
@@ -144,8 +144,8 @@ class Adapter(FrameVectorEnv):
         colours = image.shape[2] if image.ndim == 3 else 1
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or colours != self._colours:
             raise ConfigError(
-                f"shows {image.dtype} {list(image.shape)}, but an image of uint8 with {self._colours} channels "
-                "was announced"
+                f"shows {image.dtype} {list(image.shape)}, but an image of uint8 with {self._colours} "
+                "channels was announced"
             )
         image = image.reshape(*image.shape[:2], colours)
         if self._grey and colours == 3:
@@ -219,8 +219,8 @@ def _colours(env: gymnasium.Env) -> int:
     shape = image.shape if isinstance(image, Box) and image.dtype == np.uint8 else ()
     if len(shape) not in (2, 3) or shape[2:] not in ((), (1,), (3,)):
         raise ConfigError(
-            f"observations are {_text(space)}; they must be images, uint8 [H, W], [H, W, 1] or [H, W, 3], or a "
-            "Dict with one of these under 'image'; gymnasium:...,render=true takes what it renders instead"
+            f"observations are {_text(space)}; they must be images, uint8 [H, W], [H, W, 1] or [H, W, 3], or "
+            "a Dict with one of these under 'image'; gymnasium:...,render=true takes what it renders instead"
         )
     return (*shape, 1)[2]
 

@@ -49,8 +49,8 @@ class FrameVectorEnv(VectorEnv):
         single_observation_space: Box(uint8, (H, W)).
         single_action_space: Discrete(A).
         action_meanings: the A names of the actions.
-        state_names: of the numbers in `info["state"]`, float [N, V], the game's true state; () where it is not
-            known.
+        state_names: of the numbers in `info["state"]`, float [N, V], the game's true state; () where it is
+            not known.
         state_problem: why it is not known although it should be; empty where all is well.
     """
 

@@ -61,10 +61,10 @@ class Catch(FrameVectorEnv):
     The k-th episode of an environment is a function of the seed, the environment's index and k.
 
     `info` holds `life_lost` bool [N], always False, and `state` float32 [N, 5]: column and row of
-    the ball's centre (of the pixel above and left of it where the size is even), its velocity in columns and rows per env step (for the next move, but for a
-    bounce in it), and the column of the paddle's centre. Units are pixels of a frame of 84 x 84,
-    counted from 0 at the top left pixel. At size 42, a pixel of Catch is the mean of 2 x 2 of
-    these.
+    the ball's centre (where its size is even, of the pixel above and left of that), its velocity in
+    columns and rows per env step (for the next move, but for a bounce in it), and the column of the
+    paddle's centre. Units are pixels of a frame of 84 x 84, counted from 0 at the top left pixel. At
+    size 42, a pixel of Catch is the mean of 2 x 2 of these.
 
     Attributes:
         state_names: of the numbers in `state`.
@@ -268,7 +268,7 @@ class Background:
             self._velocity[env] = 0
 
     def step(self, caught: np.ndarray):
-        """Scrolls all environments by one env step; `caught` bool [N] says where a paddle that stays catches."""
+        """Scrolls all environments by one env step; `caught` bool [N]: a paddle that stays will catch."""
         if self._kind == "reward":
             speed = np.abs(self._velocity[..., 1])
             # A window that moves to the left shows textures that move to the right.

@@ -1,7 +1,7 @@
 """The registry of games: what the rest of the library has to know of each, and how its environments are made.
 
-Imports nothing heavy, so a command line can be checked at once: a row's factory only notes its options; `Game.make`
-imports what the environments need.
+Imports nothing heavy, so a command line can be checked at once: a row's factory only notes its options, and
+`Game.make` imports what the environments need.
 """
 
 import dataclasses
@@ -47,16 +47,17 @@ class Game:
     """What a row of the registry makes of its options: a game as an experiment sees it.
 
     Attributes:
-        make: makes the environments, `make(num_envs=, seed=, frame_size=, **options) -> base.FrameVectorEnv`; imports
-            what they need.
-        check: raises ConfigError, a reason that follows `--game=NAME: `, where the environments cannot be made
-            here, because something is not installed, say.
+        make: makes the environments, `make(num_envs=, seed=, frame_size=, **options) -> FrameVectorEnv` of
+            `srl_jax.envs.base`; imports what they need.
+        check: raises ConfigError, a reason that follows `--game=NAME: `, where the environments cannot be
+            made here, because something is not installed, say.
         options: the names of the options of `srl_jax.envs.make` that `make` takes beside these three.
         kind: what games have in common that take equally long; empty for the row's name.
         frame_sizes: the values of --frame_size that it knows; empty for any.
         frames_per_step: frames of the emulator in one env step.
         lives: whether a life may be lost before the game is over.
-        scores: the raw scores that count as 0 and 1 where games are averaged; None where nobody has fixed them.
+        scores: the raw scores that count as 0 and 1 where games are averaged; None: those of
+            `srl_jax.data.reference_scores`, or none.
         presets: the family of presets that the thesis' figures are run with.
     """
 
@@ -99,7 +100,7 @@ def atari(*, game: str = "Pong") -> Game:
 
 
 def catch(*, ball: int = 3, background: str = "none") -> Game:
-    """A ball to be caught, see `srl_jax.envs.catch`; `Catch` and `CatchDistractor` are short for two of these.
+    """A ball to be caught, see `srl_jax.envs.catch`; `Catch` and `CatchDistractor` stand for two of them.
 
     Args:
         ball: height and width of the ball in pixels of a frame of 84 x 84.
@@ -129,8 +130,8 @@ def gymnasium(
         id: that gymnasium.make takes; `module:Name-v0` imports the module first.
         grey: reduces colours to their luma.
         render: shows what the environment renders instead of what it observes.
-        frame_skip: env steps of the environment in one of ours, with the same action; their rewards are added.
-        max_steps: env steps (ours) after which an episode is truncated; 0 leaves that to the environment.
+        frame_skip: steps of the environment in an env step, with the same action; their rewards are added.
+        max_steps: env steps after which an episode is truncated; 0 leaves that to the environment.
     """
     if not id:
         raise ValueError("id is missing; write gymnasium:id=MiniGrid-Empty-5x5-v0, say")
@@ -182,7 +183,7 @@ def adapted(
 
 
 REGISTRY: dict[str, Callable[..., Game]] = {"atari": atari, "catch": catch, "gymnasium": gymnasium}
-"""`REGISTRY[name](**options) -> Game`; the options of `--game=name:key=value,...` are its keyword-only parameters."""
+"""`REGISTRY[name](**options) -> Game`; keyword-only parameters are the options of `--game=name:key=value`."""
 
 
 def register(name: str, factory: Callable[..., Game]) -> None:
@@ -190,8 +191,8 @@ def register(name: str, factory: Callable[..., Game]) -> None:
 
     Args:
         name: of letters, digits and _ - .
-        factory: (**options) -> Game; each option is a keyword-only parameter whose default is a bool, int, float
-            or str. It is called wherever a game's name is read, so it should import nothing heavy.
+        factory: (**options) -> Game; each option is a keyword-only parameter whose default is a bool, int,
+            float or str. It is called wherever a game's name is read, so it should import nothing heavy.
 
     Raises:
         ValueError: the name cannot be typed, or is that of another game.

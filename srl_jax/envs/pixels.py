@@ -1,4 +1,4 @@
-"""Images made grey, and larger or smaller. The sums are of whole numbers, so they are exact on every machine."""
+"""Images made grey, and larger or smaller. Sums are of whole numbers, so they are exact on every machine."""
 
 import functools
 
@@ -25,7 +25,7 @@ def averaged(image: np.ndarray, size: int) -> np.ndarray:
 
 
 def resized(image: np.ndarray, size: int) -> np.ndarray:
-    """`averaged` of an image uint8 [H, W, C], rounded: uint8 [size, size, C]; the same pixels where it fits."""
+    """`averaged` of an image uint8 [H, W, C], rounded: uint8 [size, size, C]."""
     return image if image.shape[:2] == (size, size) else np.rint(averaged(image, size)).astype(np.uint8)
 
 

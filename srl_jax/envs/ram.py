@@ -101,9 +101,9 @@ class Twin:
 class AtariWithState(Atari):
     """N copies of an Atari game with emulators in step, whose labelled bytes of memory are its state.
 
-    `info["state"]` is float64 [N, V]. In every step the next environment in turn is compared with its emulator;
-    from the first difference on the state is not known: `state_problem` says why, and there are no `state_names`.
-    A snapshot cannot be restored here: the emulators in step are not in it.
+    `info["state"]` is float64 [N, V]. In every step the next environment in turn is compared with its
+    emulator; from the first difference on the state is not known: `state_problem` says why, and there are no
+    `state_names`. A snapshot cannot be restored here: the emulators in step are not in it.
 
     Args:
         game: one of `games.ATARI_57`; one that nobody has labelled has no state.
