@@ -50,6 +50,9 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         config: of which the game, the protocol and the seed count.
         episodes: games to play.
         stop: once it says so, the games are left and there is no result.
+
+    Raises:
+        ConfigError: the policy is no-op, and the game has no such action.
     """
     from srl_jax import loop
     from srl_jax.actor import random_policy, seed_for
@@ -70,10 +73,14 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
             progress.update(games, **fields, **{"at most": at_most})
 
         progress.note(f"{config.game}, {policy} policy, {episodes:,} games")
-        noop = np.full(number, env.action_meanings.index("NOOP"), np.int32)
         act = random_policy(int(env.single_action_space.n), np.random.default_rng(seed("actions")))
+        if policy == "no-op":
+            if "NOOP" not in env.action_meanings:
+                raise ConfigError(f"--policies=no-op: {config.game} has no action NOOP; valid: random")
+            noop = np.full(number, env.action_meanings.index("NOOP"), np.int32)
+            act = lambda *_: noop  # noqa: E731
         played = evaluate(
-            act if policy == "random" else lambda *_: noop,
+            act,
             env,
             games=episodes,
             seed=seed("games"),

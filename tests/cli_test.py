@@ -138,7 +138,8 @@ def test_short_flags_stand_for_options_of_rl():
 
 BAD = [
     (["--game=Pogn"], "--game=Pogn", "did you mean Pong?"),
-    (["--game=Pogn"], "--game=Pogn", "Breakout"),
+    (["--game=Pogn"], "--game=Pogn", "gymnasium:id=Name-v0, module:Name-v0"),
+    (["--game=ALE/Pong-v5"], "--game=ALE/Pong-v5", "did you mean Pong?"),
     (["--preset=thesis/joint_25"], "--preset=thesis/joint_25", "did you mean thesis/joint_256?"),
     (["--preset="], "--preset=", "valid: "),
     (["--mode=jiont"], "--mode=jiont", "did you mean joint?"),
@@ -184,7 +185,7 @@ BAD = [
     (["--rl=rainbow:v_max=1e39"], "--rl=rainbow:v_max=1e39", "at most 3.402823466e+38"),
     (["--encoder=tiny:features=100000"], "--encoder=tiny:features=100000", "at most 65536"),
     (["--out=a\nb"], "--out=a b", "'\\n'; name it with printable ones"),
-    (["--game=\x1b[31m"], "--game=\\x1b[31m", "valid: Alien"),
+    (["--game=\x1b[31m"], "--game=\\x1b[31m", "valid: an Atari-57 game"),
     (["--game=Pong", "--game=Catch"], "--game: given 2 times", "give it once"),
     (["--steps=5", "--steps=5", "--steps=5"], "--steps: given 3 times", "give it once"),
     (["--reward_clip", "--noreward_clip"], "--reward_clip: given 2 times", "give it once"),
@@ -559,7 +560,7 @@ def test_print_config_shows_every_preset(preset, capsys, loop):
 def test_the_entry_point_refuses_a_game_in_one_line(tmp_path):
     done = _python("-m", "experiments.train", "--game=Pogn", f"--out={tmp_path}/a")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: --game=Pogn: did you mean Pong? valid: Alien, ")
+    assert done.stderr.startswith("error: --game=Pogn: did you mean Pong? valid: an Atari-57 game (")
     assert done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 

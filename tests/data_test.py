@@ -6,7 +6,9 @@ import pytest
 
 from srl_jax.config import Config
 from srl_jax.data import Published, published, reference_scores
-from srl_jax.envs import ATARI_57, CATCH
+from srl_jax.envs import ATARI_57
+
+CATCH = ("Catch", "CatchDistractor")
 
 PONG = Config(game="Pong", steps=1_000_000)
 

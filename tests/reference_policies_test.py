@@ -12,9 +12,10 @@ from experiments import flags as config_flags
 from experiments import reference_policies as played
 from srl_jax.config import Config
 from srl_jax.data import POLICIES, published, reference_policies
-from srl_jax.envs import ATARI_57, CATCH
+from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError
 
+CATCH = ("Catch", "CatchDistractor")
 THESIS = ("Breakout", "Enduro", "MsPacman", "Pong", "Qbert", "Seaquest", "SpaceInvaders")
 
 

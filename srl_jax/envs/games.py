@@ -133,8 +133,9 @@ def gymnasium(
         frame_skip: steps of the environment in an env step, with the same action; their rewards are added.
         max_steps: env steps after which an episode is truncated; 0 leaves that to the environment.
     """
-    if not id:
-        raise ValueError("id is missing; write gymnasium:id=MiniGrid-Empty-5x5-v0, say")
+    if not re.fullmatch(r"[\w:./-]+", id):
+        what = f"id={id!r} is none" if id else "id is missing"
+        raise ValueError(f"{what}; write gymnasium:id=MiniGrid-Empty-5x5-v0, say")
 
     def make_one():
         from srl_jax.envs.adapter import made

@@ -41,10 +41,11 @@ def summary(
 
     Returns:
         Rows with the keys arm, against (the baseline, or None), game (None: over all games that every arm
-        has and that have reference scores), statistic, point, low, high (None: no interval), kind (see `Interval`), runs (their number in
-        words). Statistics: "return" of each game, unnormalised; `AGGREGATES` of human-normalised scores;
-        against the baseline "return_difference" of each game, "mean_difference" and so on, the arm's minus
-        the baseline's, and "probability_of_improvement". There is no row for what the arms do not share.
+        has and that have reference scores), statistic, point, low, high (None: no interval), kind (see
+        `Interval`), runs (their number in words). Statistics: "return" of each game, unnormalised;
+        `AGGREGATES` of human-normalised scores; against the baseline "return_difference" of each game,
+        "mean_difference" and so on, the arm's minus the baseline's, and "probability_of_improvement". There
+        is no row for what the arms do not share.
 
     Raises:
         ValueError: the baseline is no arm, or what `mean` raises.
