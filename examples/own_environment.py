@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Dot(gymnasium.Env):
-    """Actions move the dot by four pixels: left, right, up, down. The green place pays 1 and ends the episode."""
+    """The dot goes four pixels left, right, up or down; at the green place it gets 1, and the episode ends."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
     action_space = gymnasium.spaces.Discrete(4)

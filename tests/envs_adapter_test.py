@@ -206,8 +206,8 @@ def test_an_environment_that_is_not_deterministic_is_not_resumed():
     with pytest.raises(ValueError) as raised:
         again.restore(env.snapshot())
     assert str(raised.value) == (
-        "environments [0, 1] cannot be rebuilt: not the snapshot's frames_sha256; the same seed and actions did "
-        "not lead there again, so the environment is not deterministic and a run cannot be resumed"
+        "environments [0, 1] cannot be rebuilt: not the snapshot's frames_sha256; the same seed and actions "
+        "did not lead there again, so the environment is not deterministic and a run cannot be resumed"
     )
     with pytest.raises(ResetNeeded):
         again.step(np.zeros(2, int))

@@ -265,7 +265,7 @@ def test_both_games_drop_the_same_balls():
     ],
 )
 def test_the_games_with_a_name_are_what_they_were(game, size, digest):
-    # As they were when Catch had one ball and two backgrounds (revision 2612025): published runs are of these.
+    # As they were when Catch had one ball and two backgrounds (revision 2612025): published runs are of them.
     env = envs.make(game, num_envs=3, seed=7, frame_size=size)
     found = hashlib.sha256()
     frames, info = env.reset()
@@ -283,8 +283,8 @@ def test_the_games_with_a_name_are_what_they_were(game, size, digest):
 
 @pytest.mark.parametrize("ball", [1, 2, 4, 12])
 def test_balls_of_other_sizes(ball):
-    # As many bright pixels as the ball has, around its state, or half a pixel more to the right and below where
-    # their number is even; and at 42 x 42 the mean of 2 x 2 pixels.
+    # As many bright pixels as the ball has, around its state, or half a pixel more to the right and below
+    # where its size is even; and at 42 x 42 the mean of 2 x 2 pixels.
     actions = np.random.default_rng(0).integers(0, 3, (40, 8))
     large = record(envs.make(f"catch:ball={ball}", num_envs=8, seed=3), actions)
     frames = np.concatenate([x for x in large if x.ndim == 3]).astype(float)
