@@ -14,7 +14,7 @@ import numpy as np
 
 
 class Dot(gymnasium.Env):
-    """The dot goes four pixels left, right, up or down; at the green place it gets 1, and the episode ends."""
+    """The dot goes four pixels left, right, up or down; at the green place it gets 1, and that is the end."""
 
     observation_space = gymnasium.spaces.Box(0, 255, (64, 64, 3), np.uint8)
     action_space = gymnasium.spaces.Discrete(4)

@@ -1,5 +1,7 @@
 """Any gymnasium environment behind the interface that Atari and Catch have, on small ones written here."""
 
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -8,7 +10,7 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 
 from experiments.soaking.snapshots import MOMENTS, Player, goes_on
 from srl_jax import envs
-from srl_jax.envs import games, pixels
+from srl_jax.envs import adapter, games, pixels
 from srl_jax.errors import ConfigError
 
 
@@ -282,6 +284,11 @@ def test_an_environment_by_its_id(tmp_path, monkeypatch):
     env.reset()
     ends = [env.step(np.array([0]))[3][0] for _ in range(3)]
     assert ends == [False, False, True]  # gymnasium's own limit
+    assert "SrlJaxSquare-v0" in gymnasium.registry
+    monkeypatch.delitem(gymnasium.registry, "SrlJaxSquare-v0")
+    monkeypatch.delitem(sys.modules, "srl_jax_own")
+    monkeypatch.setitem(adapter.PACKAGES, "SrlJaxSquare", "srl_jax_own")
+    games.game("gymnasium:id=SrlJaxSquare-v0").check()  # the package is known
     for text, says in (
         ("gymnasium:id=Nonesuch-v0", "cannot be made: NameNotFound: Environment `Nonesuch` doesn't exist"),
         ("nonesuch_module:A-v0", "cannot be made: ModuleNotFoundError: No module named 'nonesuch_module'"),

@@ -1,5 +1,6 @@
 """Any gymnasium environment with discrete actions that shows images, as a `base.FrameVectorEnv`."""
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -12,9 +13,15 @@ from srl_jax.envs import pixels
 from srl_jax.envs.base import Form, FrameVectorEnv
 from srl_jax.errors import ConfigError
 
+PACKAGES = {"MiniGrid": "minigrid", "BabyAI": "minigrid", "MiniWorld": "miniworld", "ALE": "ale_py"}
+"""The first word of ids: the package that has to be imported for gymnasium to know them."""
+
 
 def made(id: str, render: bool) -> gymnasium.Env:
-    """An environment by its id, whose module is imported where it names one, `module:Name-v0`."""
+    """An environment by its id; `module:Name-v0` imports the module first, which is known for `PACKAGES`."""
+    package = PACKAGES.get(re.split("[-/]", id)[0])
+    if package and id not in gymnasium.registry:
+        id = f"{package}:{id}"
     return gymnasium.make(id, render_mode="rgb_array" if render else None, disable_env_checker=True)
 
 
