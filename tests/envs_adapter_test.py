@@ -277,7 +277,7 @@ def test_an_environment_by_its_id(tmp_path, monkeypatch):
     (tmp_path / "srl_jax_own.py").write_text(
         "import gymnasium\n"
         "from tests.envs_adapter_test import Square\n"
-        "gymnasium.register('SrlJaxSquare-v0', lambda render_mode: Square(), max_episode_steps=3)\n"
+        "gymnasium.register('SrlJaxSquare-v0', Square, max_episode_steps=3)\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
     env = envs.make("srl_jax_own:SrlJaxSquare-v0,grey=true", num_envs=1, seed=0, frame_size=32, noop_max=3)

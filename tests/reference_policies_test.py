@@ -137,6 +137,17 @@ def test_what_was_played_until_a_signal_is_kept(tmp_path, capsys, monkeypatch):
     assert "no-op" not in capsys.readouterr().out
 
 
+def test_a_game_without_an_action_that_does_nothing(tmp_path, capsys):
+    arguments = "--games=examples.own_environment:Dot-v0,grey=true", "--episodes=2", "--eval_max_steps=5"
+    with pytest.raises(
+        ConfigError, match="--policies=no-op: gymnasium:id=.* has no action NOOP; valid: random"
+    ):
+        _run(*arguments)
+    (_, row) = csv.reader(capsys.readouterr().out.splitlines())  # it was played before
+    assert row[0].startswith("gymnasium:id=examples.own_environment:Dot-v0,grey=true")
+    assert row[1] == "random" and row[6:8] == ["", ""]  # it has no sticky actions, and no no-ops
+
+
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [

@@ -22,7 +22,8 @@ def made(id: str, render: bool) -> gymnasium.Env:
     package = PACKAGES.get(re.split("[-/]", id)[0])
     if package and id not in gymnasium.registry:
         id = f"{package}:{id}"
-    return gymnasium.make(id, render_mode="rgb_array" if render else None, disable_env_checker=True)
+    mode = {"render_mode": "rgb_array"} if render else {}
+    return gymnasium.make(id, disable_env_checker=True, **mode)
 
 
 class Adapter(FrameVectorEnv):
