@@ -25,9 +25,7 @@ def test_games_that_nobody_has_measured():
     assert with_reference_scores(games) == ["Pong", "catch:ball=2,background=none"]
     for game in games[1:]:
         assert published(game) == [] and reference_policies(game) == {}
-    with pytest.raises(
-        ValueError, match="no reference scores for game gymnasium:id=A-v0; there are some for"
-    ):
+    with pytest.raises(ValueError, match="no reference scores for game gymnasium:id=A-v0; there are"):
         reference_scores("gymnasium:id=A-v0")
 
 

@@ -139,9 +139,7 @@ def test_what_was_played_until_a_signal_is_kept(tmp_path, capsys, monkeypatch):
 
 def test_a_game_without_an_action_that_does_nothing(tmp_path, capsys):
     arguments = "--games=examples.own_environment:Dot-v0,grey=true", "--episodes=2", "--eval_max_steps=5"
-    with pytest.raises(
-        ConfigError, match="--policies=no-op: gymnasium:id=.* has no action NOOP; valid: random"
-    ):
+    with pytest.raises(ConfigError, match="--policies=no-op: gymnasium:id=.* has no action NOOP; valid"):
         _run(*arguments)
     (_, row) = csv.reader(capsys.readouterr().out.splitlines())  # it was played before
     assert row[0].startswith("gymnasium:id=examples.own_environment:Dot-v0,grey=true")
