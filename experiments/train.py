@@ -90,6 +90,13 @@ def check_extras(config: Config) -> None:
         raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
 
 
+def say_unused(values: flags.FlagValues, game: str) -> None:
+    """A line for each flag that was given and that the game's environments have no use for."""
+    for name in ("sticky_actions", "noop_max"):
+        if values[name].present and name not in envs.game(game).options:
+            display.say(f"--{name}: changes nothing, {game} has none")
+
+
 def check_paths(config: Config) -> None:
     """Whether the paths that the run starts from exist.
 
@@ -176,6 +183,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     if not resume and not values["overwrite"].value:
         for directory, _ in runs:
             say_anew(directory)
+    say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
             holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)

@@ -540,6 +540,22 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
     assert checkpoint.read_manifest(out).files == checkpoint.read_manifest(whole).files
 
 
+def test_a_flag_that_a_game_has_no_use_for_is_named(capsys, loop, tmp_path):
+    _train("--game=Catch", "--sticky_actions=0.25", f"--out={tmp_path}/a")
+    assert "--sticky_actions: changes nothing, Catch has none" in capsys.readouterr().err
+    _train("--game=Pong", "--sticky_actions=0.25", f"--out={tmp_path}/b")
+    _train("--preset=catch/rl_only", f"--out={tmp_path}/c")
+    assert "changes nothing" not in capsys.readouterr().err
+
+
+def test_a_game_that_cannot_be_made_leaves_nothing(capsys, loop, tmp_path):
+    with pytest.raises(SystemExit):
+        _train("--game=nonesuch_module:E-v0", f"--out={tmp_path}/a")
+    line = capsys.readouterr().err
+    assert "--game=nonesuch_module:E-v0: cannot be made: ModuleNotFoundError: No module named" in line
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):
     monkeypatch.setattr(train.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit):

@@ -129,7 +129,8 @@ def gymnasium(
     Args:
         id: that gymnasium.make takes; `module:Name-v0` imports the module first.
         grey: reduces colours to their luma.
-        render: shows what the environment renders instead of what it observes.
+        render: shows what the environment renders instead of what it observes (MiniGrid observes codes of
+            objects, which make a dark image, and renders colours).
         frame_skip: steps of the environment in an env step, with the same action; their rewards are added.
         max_steps: env steps after which an episode is truncated; 0 leaves that to the environment.
     """
