@@ -14,9 +14,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from srl_jax import envs
 from srl_jax.config import INFOS
 from srl_jax.data import thesis_curve
-from srl_jax.envs import CATCH
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text, near
@@ -42,7 +42,7 @@ class FigureArm(NamedTuple):
 
     def preset_for(self, game: str) -> str:
         """The preset of its runs on a game: Catch is played by small networks."""
-        return self.preset or f"{'small' if game in CATCH else 'thesis'}/{self.name}"
+        return self.preset or f"{envs.game(game).presets}/{self.name}"
 
     def thesis_curve(self, game: str) -> tuple | None:
         """env steps and returns of the thesis' curve, or None."""

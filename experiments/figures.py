@@ -18,10 +18,9 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from srl_jax import display, statistics
+from srl_jax import display, envs, statistics
 from srl_jax.config import Config
 from srl_jax.data import published, reference_policies
-from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
 
@@ -267,7 +266,7 @@ def run(values: flags.FlagValues) -> int:
     out = values["out"].value
     root = config_flags.check_place("out", out)
     options = sweep.launcher_options(values)
-    seeds, games = parse_seeds(values["seeds"].value), list(dict.fromkeys(values["games"].value))
+    seeds, games = parse_seeds(values["seeds"].value), envs.several(values["games"].value)
     runs = planned(figures, games, seeds, sweep.given_flags(values))
     sweep.say_what_is_replaced(values, runs)
     methods = _known(values["published"].value)
@@ -316,7 +315,7 @@ def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directo
 
 def _known(text: str) -> list[str]:
     methods = [name for name in text.split(",") if name]
-    known = dict.fromkeys(entry.method for game in ATARI_57 for entry in published(game))
+    known = dict.fromkeys(entry.method for game in envs.ATARI_57 for entry in published(game))
     for name in methods:
         if name not in known:
             raise ConfigError(f"--published={text}: {choices_text(name, known)}")

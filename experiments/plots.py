@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from srl_jax.envs import ATARI_57
+from srl_jax import envs
 
 STEPS_LABEL = "env steps"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
@@ -24,8 +24,9 @@ NEAR = 0.02
 
 
 def steps_label(game: str) -> str:
-    """Of an axis of env steps: an Atari game has several frames in one."""
-    return f"{STEPS_LABEL} (4 frames each)" if game in ATARI_57 else STEPS_LABEL
+    """Of an axis of env steps, which may have several frames of an emulator in one; "" is no game."""
+    frames = envs.game(game).frames_per_step if game else 1
+    return f"{STEPS_LABEL} ({frames} frames each)" if frames > 1 else STEPS_LABEL
 
 
 def available() -> bool:

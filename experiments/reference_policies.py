@@ -24,9 +24,9 @@ from typing import Any
 import numpy as np
 from absl import flags
 
+from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
-from srl_jax.envs import CATCH, GAMES
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.progress import Progress, hms
 from srl_jax.specs import Info, choices_text, value_text
@@ -51,6 +51,9 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         config: of which the game, the protocol and the seed count.
         episodes: games to play.
         stop: once it says so, the games are left and there is no result.
+
+    Raises:
+        ConfigError: the policy is no-op, and the game has no such action.
     """
     from srl_jax.actor import make_env, random_policy, seed_for
     from srl_jax.evaluate import evaluate
@@ -70,10 +73,14 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
             progress.update(games, **fields, **{"at most": at_most})
 
         progress.note(f"{config.game}, {policy} policy, {episodes:,} games")
-        noop = np.full(number, env.action_meanings.index("NOOP"), np.int32)
         act = random_policy(int(env.single_action_space.n), np.random.default_rng(seed("actions")))
+        if policy == "no-op":
+            if "NOOP" not in env.action_meanings:
+                raise ConfigError(f"--policies=no-op: {config.game} has no action NOOP; valid: random")
+            noop = np.full(number, env.action_meanings.index("NOOP"), np.int32)
+            act = lambda *_: noop  # noqa: E731
         played = evaluate(
-            act if policy == "random" else lambda *_: noop,
+            act,
             env,
             games=episodes,
             seed=seed("games"),
@@ -85,7 +92,7 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         )
     if played is None:
         return None
-    atari = config.game not in CATCH  # which knows neither sticky actions nor no-ops
+    known = envs.game(config.game).options
     return ReferencePolicy(
         config.game,
         policy,
@@ -93,8 +100,8 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         round(float(np.std(played.returns, ddof=1)), 6) if episodes > 1 else None,
         episodes,
         round(float(np.mean(played.lengths)), 3),
-        config.sticky_actions if atari else None,
-        config.noop_max if atari else None,
+        config.sticky_actions if "sticky_actions" in known else None,
+        config.noop_max if "noop_max" in known else None,
         config.eval_max_steps,
         _command(config, policy, episodes),
     )
@@ -184,7 +191,9 @@ def run(values: flags.FlagValues) -> int:
         ConfigError: the command line is not valid; nothing was written.
         SaveError: the file cannot be written.
     """
-    games = _chosen("games", values["games"].value, tuple(GAMES))
+    games = envs.several(values["games"].value)
+    if not games:
+        raise ConfigError("--games: names none; give Catch or Pong, say")
     policies = _chosen("policies", values["policies"].value, POLICIES)
     episodes, out = values["episodes"].value, values["out"].value
     given: Mapping[str, Any] = {name: values[name].value for name in (*PROTOCOL, "seed")}

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax import display, plugins
+from srl_jax import display, envs, plugins
 from srl_jax.config import INFOS, SOURCES, Config, resolve
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.rundir import check_free
@@ -78,18 +78,39 @@ def check_seeds(values: flags.FlagValues) -> list[int]:
 
 
 def check_extras(config: Config) -> None:
-    """Whether the optional packages that the run needs are installed.
+    """Whether the run's environments can be made here, and the optional packages that it needs are installed.
 
     Raises:
-        ConfigError: one is not; the line says which extra has it.
+        ConfigError: they cannot; the line says why, or which extra has the package.
     """
-    if not config.game.startswith("Catch") and importlib.util.find_spec("ale_py") is None:
-        raise ConfigError(
-            f"--game={config.game}: Atari needs ale-py, pip install 'srl-jax[atari]'; "
-            "valid without it: Catch, CatchDistractor"
-        )
+    check_game(config, imported=False)
     if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
         raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
+
+
+def check_game(config: Config, imported: bool) -> None:
+    """Whether the game's environments can be made here; one of a plug-in is known once that is `imported`.
+
+    Raises:
+        ConfigError: they cannot; the line says why.
+    """
+    try:
+        game = envs.game(config.game)
+    except ConfigError:
+        if imported or not config.imports:
+            raise
+        return
+    try:
+        game.check()
+    except ConfigError as error:
+        raise ConfigError(f"--game={config.game}: {error}") from None
+
+
+def say_unused(values: flags.FlagValues, game: str) -> None:
+    """A line for each flag that was given and that the game's environments have no use for."""
+    for name in ("sticky_actions", "noop_max"):
+        if values[name].present and name not in envs.game(game).options:
+            display.say(f"--{name}: changes nothing, {game} has none")
 
 
 def check_paths(config: Config) -> None:
@@ -119,12 +140,14 @@ def resolved(config: Config) -> Config:
     from srl_jax import encoders, objectives, rl
     from srl_jax.types import Context
 
-    plugins.load(config.imports)
-
+    if config.imports:
+        plugins.load(config.imports)
+        check_game(config, imported=True)
     full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
     # Options may be valid one by one and not together, or not for these frames: only a factory
     # knows. The number of actions is not known yet; any will do for that.
-    shape = (config.frame_size, config.frame_size, config.frame_stack)
+    size = config.frame_size or 84  # an environment's own is known once it is made
+    shape = (size, size, config.frame_stack)
     encoder = build(parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
     context = Context.of(encoder, num_actions=18)
     build(parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
@@ -183,6 +206,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     if not resume and not values["overwrite"].value:
         for directory, _ in runs:
             say_anew(directory)
+    say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
             holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)

@@ -16,8 +16,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from srl_jax import modes, specs
-from srl_jax.envs import FRAME_SKIP, GAMES
+from srl_jax import envs, modes, specs
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import Info
@@ -61,7 +60,11 @@ class Config:
             flag.
     """
 
-    game: str = _value(str, "Pong", "an Atari-57 game, Catch or CatchDistractor", choices=tuple(GAMES))
+    game: str = _value(
+        str, "Pong",
+        "an Atari-57 game, Catch, CatchDistractor, catch:ball=2,background=moving, gymnasium:id=Name-v0, or "
+        "module:Name-v0, which imports the module",
+    )  # fmt: skip
     mode: str = _value(
         str, "rl_only", "; ".join(f"{m.name}: {m.help}" for m in modes.MODES.values()),
         choices=tuple(modes.MODES),
@@ -149,7 +152,7 @@ class Config:
     eval_games: int = _value(int, 10, "full games of one evaluation", "games", minimum=1)
     eval_max_steps: int = _value(
         int, 27_000, "longest evaluation game (27,000 are 108,000 frames)", "env steps",
-        minimum=1, maximum=specs.LIMITS[int] // FRAME_SKIP,
+        minimum=1, maximum=specs.LIMITS[int] // envs.FRAME_SKIP,
     )  # fmt: skip
     stop_at_return: float | None = _value(
         float, None, "mean evaluation return that ends the run early, or off", "unclipped score",
@@ -190,9 +193,10 @@ class Config:
     frame_size: int = _value(
         int,
         84,
-        "height and width of a frame; Catch knows 42 and 84",
+        "height and width of a frame, to which others are resized, 0 for a gymnasium environment's own; Catch "
+        "knows 42 and 84",
         "pixels",
-        minimum=1,
+        minimum=0,
         maximum=1_024,
     )
     frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1, maximum=256)
@@ -240,8 +244,18 @@ class Config:
         self._check_together()
 
     def _check_together(self) -> None:
-        if self.game.startswith("Catch") and self.frame_size not in (42, 84):
-            raise ConfigError(f"--frame_size={self.frame_size}: --game={self.game} knows 42 and 84")
+        try:
+            game = envs.game(self.game)
+        except specs.SpecError:
+            if not self.imports:  # else it may be a row of what is imported later, see `resolve`
+                raise
+            game = envs.Game(make=lambda: None, own_size=True)
+        if not (self.frame_size or game.own_size):
+            raise ConfigError(f"--frame_size=0: --game={self.game} has no size of its own; give one, say 84")
+        sizes = game.frame_sizes
+        if sizes and self.frame_size not in sizes:
+            known = " and ".join(map(str, sizes))
+            raise ConfigError(f"--frame_size={self.frame_size}: --game={self.game} knows {known}")
         for name in ("batch_size", "learn_start"):
             if getattr(self, name) > self.buffer_size:
                 value = f"--{name}={getattr(self, name)}"
@@ -304,6 +318,8 @@ def resolve(
 ) -> Config:
     """Writes out everything that the config leaves to a default: all options, rates and intervals.
 
+    A game gets its canonical name, see `srl_jax.envs.canonical`.
+
     Returns:
         A Config that resolves to itself; what config.json holds.
 
@@ -319,6 +335,7 @@ def resolve(
             raise ConfigError(f"--objective={objective}: {objective.name} is given twice")
     return dataclasses.replace(
         config,
+        game=envs.canonical(config.game),
         rl=rl.full,
         encoder=encoder.full,
         objectives=tuple(objective.full for objective in objectives),

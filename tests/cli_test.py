@@ -173,7 +173,8 @@ def test_settings_come_from_a_config_file(tmp_path, loop):
 
 BAD = [
     (["--game=Pogn"], "--game=Pogn", "did you mean Pong?"),
-    (["--game=Pogn"], "--game=Pogn", "Breakout"),
+    (["--game=Pogn"], "--game=Pogn", "gymnasium:id=Name-v0, module:Name-v0"),
+    (["--game=ALE/Pong-v5"], "--game=ALE/Pong-v5", "did you mean Pong?"),
     (["--preset=thesis/joint_25"], "--preset=thesis/joint_25", "did you mean thesis/joint_256?"),
     (["--preset="], "--preset=", "valid: "),
     (["--mode=jiont"], "--mode=jiont", "did you mean joint?"),
@@ -234,7 +235,7 @@ BAD = [
     (["--rl=rainbow:v_max=1e39"], "--rl=rainbow:v_max=1e39", "at most 3.402823466e+38"),
     (["--encoder=tiny:features=100000"], "--encoder=tiny:features=100000", "at most 65536"),
     (["--out=a\nb"], "--out=a b", "'\\n'; name it with printable ones"),
-    (["--game=\x1b[31m"], "--game=\\x1b[31m", "valid: Alien"),
+    (["--game=\x1b[31m"], "--game=\\x1b[31m", "valid: an Atari-57 game"),
     (["--game=Pong", "--game=Catch"], "--game: given 2 times", "give it once"),
     (["--steps=5", "--steps=5", "--steps=5"], "--steps: given 3 times", "give it once"),
     (["--reward_clip", "--noreward_clip"], "--reward_clip: given 2 times", "give it once"),
@@ -612,6 +613,22 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
     assert checkpoint.read_manifest(out).files == checkpoint.read_manifest(whole).files
 
 
+def test_a_flag_that_a_game_has_no_use_for_is_named(capsys, loop, tmp_path):
+    _train("--game=Catch", "--sticky_actions=0.25", f"--out={tmp_path}/a")
+    assert "--sticky_actions: changes nothing, Catch has none" in capsys.readouterr().err
+    _train("--game=Pong", "--sticky_actions=0.25", f"--out={tmp_path}/b")
+    _train("--preset=catch/rl_only", f"--out={tmp_path}/c")
+    assert "changes nothing" not in capsys.readouterr().err
+
+
+def test_a_game_that_cannot_be_made_leaves_nothing(capsys, loop, tmp_path):
+    with pytest.raises(SystemExit):
+        _train("--game=nonesuch_module:E-v0", f"--out={tmp_path}/a")
+    line = capsys.readouterr().err
+    assert "--game=nonesuch_module:E-v0: cannot be made: ModuleNotFoundError: No module named" in line
+    assert not list(tmp_path.iterdir())
+
+
 def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):
     monkeypatch.setattr(train.importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit):
@@ -632,7 +649,7 @@ def test_print_config_shows_every_preset(preset, capsys, loop):
 def test_the_entry_point_refuses_a_game_in_one_line(tmp_path):
     done = _python("-m", "experiments.train", "--game=Pogn", f"--out={tmp_path}/a")
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: --game=Pogn: did you mean Pong? valid: Alien, ")
+    assert done.stderr.startswith("error: --game=Pogn: did you mean Pong? valid: an Atari-57 game (")
     assert done.stderr.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 

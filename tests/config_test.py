@@ -112,6 +112,8 @@ def test_every_number_is_limited(name):
     ("values", "message"),
     [
         ({"game": "Pogn"}, "--game=Pogn: did you mean Pong?"),
+        ({"game": "catch:ball=99"}, "--game=catch:ball=99: ball must be at least 1 and at most 12"),
+        ({"game": "catch:ball=1", "frame_size": 50}, "--frame_size=50: --game=catch:ball=1 knows 42 and 84"),
         ({"mode": "jiont"}, "--mode=jiont: did you mean joint?"),
         ({"augment": "both"}, "--augment=both: valid: none, srl, all"),
         ({"objectives": "first"}, "--objective='first': not of type tuple"),
@@ -192,6 +194,13 @@ def test_git_revision(tmp_path, monkeypatch):
     below = tmp_path / "site-packages" / "srl_jax" / "config.py"
     monkeypatch.setattr(config_module, "__file__", str(below))
     assert config_module.git_revision() is None
+
+
+def test_a_game_is_resolved_to_its_one_name():
+    names = {"atari:game=Pong": "Pong", "catch:background=moving": "CatchDistractor"}
+    names |= {"catch:ball=2": "catch:ball=2,background=none", "Catch": "Catch"}
+    for typed, name in names.items():
+        assert resolve(Config(game=typed), *REGISTRIES).game == name
 
 
 def test_resolving_writes_out_every_default():

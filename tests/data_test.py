@@ -5,10 +5,28 @@ from dataclasses import replace
 import pytest
 
 from srl_jax.config import Config
-from srl_jax.data import Published, published, reference_scores
-from srl_jax.envs import ATARI_57, CATCH
+from srl_jax.data import (
+    Published,
+    published,
+    reference_policies,
+    reference_scores,
+    with_reference_scores,
+)
+from srl_jax.envs import ATARI_57
+
+CATCH = ("Catch", "CatchDistractor")
 
 PONG = Config(game="Pong", steps=1_000_000)
+
+
+def test_games_that_nobody_has_measured():
+    assert reference_scores("catch:ball=1,background=static") == (-1, 1)
+    games = ["Pong", "gymnasium:id=A-v0", "catch:ball=2,background=none", "nothing"]
+    assert with_reference_scores(games) == ["Pong", "catch:ball=2,background=none"]
+    for game in games[1:]:
+        assert published(game) == [] and reference_policies(game) == {}
+    with pytest.raises(ValueError, match="no reference scores for game gymnasium:id=A-v0; there are"):
+        reference_scores("gymnasium:id=A-v0")
 
 
 def test_every_game_has_a_lower_and_a_higher_reference_score():

@@ -381,6 +381,42 @@ def test_the_emulator_whose_memory_is_read_is_in_step(sticky_actions):
     env.close()
 
 
+def test_a_state_is_known_until_an_emulator_is_out_of_step():
+    pytest.importorskip("ale_py")
+    options = {"num_envs": 2, "seed": 0, "frame_size": 42, "noop_max": 0}
+    env, plain = envs.make("Pong", with_state=True, **options), envs.make("Pong", **options)
+    frames, info = env.reset()
+    np.testing.assert_array_equal(frames, plain.reset()[0])
+    assert "state" not in plain.reset()[1] and plain.state_names == ()
+    for _ in range(4):
+        frames, *_, info = env.step(np.array([2, 3]))
+    names = env.state_names
+    assert len(names) == 6 and info["state"].shape == (2, 6) and not env.state_problem
+    assert info["state"][0, names.index("player_y")] != info["state"][1, names.index("player_y")]
+    env._twins[1].step(0, look=False)  # it is ahead now
+    for _ in range(2):  # each is compared at its turn
+        *_, info = env.step(np.array([2, 3]))
+    assert env.state_names == () and "out of step: frame number" in env.state_problem
+    assert info["state"].shape == (2, 6)
+    unlabelled = envs.make("Zaxxon", with_state=True, **options)
+    assert unlabelled.reset()[1]["state"].shape == (2, 0)
+    assert unlabelled.state_names == () and not unlabelled.state_problem
+
+
+def test_a_state_that_is_lost_is_not_probed(monkeypatch):
+    def lost(game, **options):
+        env = made(game, **options)
+        env.state_names, env.state_problem = (), "out of step"
+        return env
+
+    made = envs.make
+    monkeypatch.setattr(envs, "make", lost)
+    monkeypatch.setattr(heldout, "WINDOWS", 40)
+    held_out = heldout.collect(Config(**SMALL), 1)
+    assert (held_out.variables, held_out.problem) == ((), "out of step")
+    assert held_out.states.shape == (40, 0)
+
+
 def test_labelled_bytes_hold_what_is_seen(monkeypatch):
     pytest.importorskip("ale_py")
     monkeypatch.setattr(heldout, "WINDOWS", 96)

@@ -1,5 +1,7 @@
 """Catch and CatchDistractor, and with them the interface that Atari shares."""
 
+import hashlib
+
 import jax
 import numpy as np
 import pytest
@@ -8,6 +10,7 @@ from hypothesis import strategies as st
 
 from srl_jax import encoders, envs
 from srl_jax.envs import catch
+from srl_jax.envs.games import BACKGROUNDS
 
 LEFT, NOOP, RIGHT = range(3)
 BOTH = pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
@@ -141,19 +144,21 @@ def test_every_encoder_sees_the_paddle(name, size):
     assert np.abs(latents[0] - latents[1]).max() > 1e-4
 
 
-def test_every_start_can_be_won():
-    # All starts at once, without the drawing: fall, steps, column, drift, paddle.
+@pytest.mark.parametrize("ball", [1, 2, 3, 4, 12])
+def test_every_start_can_be_won(ball):
+    # All starts at once, without the drawing: fall, steps, column, drift, paddle. The ball lands on row 75.
+    before, after = (ball - 1) // 2, ball // 2
     starts = np.array(
         [
-            (x, catch.LAST_ROW - steps * fall, drift, fall, paddle)
+            (x, 75 - after - steps * fall, drift, fall, paddle)
             for fall, steps in catch.DROPS
-            for x in range(catch.BALL_LEFT, catch.BALL_RIGHT + 1)
+            if 75 - after - steps * fall >= before
+            for x in range(before, 84 - after)
             for drift in range(-catch.MAX_DRIFT, catch.MAX_DRIFT + 1)
             for paddle in (24, 42, 59)
         ]
     )
-    assert starts[:, 1].min() >= catch.BALL_RADIUS
-    env = envs.make("Catch", num_envs=len(starts), seed=0)
+    env = envs.make(f"catch:ball={ball}", num_envs=len(starts), seed=0)
     env._frames = lambda: None
     put(env, *starts.T)
     caught = np.zeros(len(starts), bool)
@@ -246,3 +251,163 @@ def test_both_games_drop_the_same_balls():
         out = record(envs.make(game, num_envs=5, seed=9), actions)
         runs.append([x for x in out if x.dtype != np.uint8])
     assert same(*runs)
+
+
+@pytest.mark.parametrize(
+    ("game", "size", "digest"),
+    [
+        ("Catch", 84, "0eea7902ec36ce16"),
+        ("Catch", 42, "39ad75bebd34e476"),
+        ("CatchDistractor", 84, "20a75d94ca16c940"),
+        ("CatchDistractor", 42, "bb3e19f006b7ab92"),
+    ],
+)
+def test_the_games_with_a_name_are_what_they_were(game, size, digest):
+    # As they were when Catch had one ball and two backgrounds (revision 2612025): published runs are of them.
+    env = envs.make(game, num_envs=3, seed=7, frame_size=size)
+    found = hashlib.sha256()
+    frames, info = env.reset()
+    arrays = [frames, info["state"]]
+    for action in np.random.default_rng(0).integers(0, 3, (100, 3)):
+        frames, rewards, terminated, _, info = env.step(action)
+        arrays += [frames, rewards, terminated, info["state"]]
+        if terminated.any():
+            frames, info = env.reset(options={"reset_mask": terminated})
+            arrays += [frames, info["state"]]
+    for array in arrays:
+        found.update(np.ascontiguousarray(array).tobytes())
+    assert found.hexdigest()[:16] == digest
+
+
+@pytest.mark.parametrize("ball", [1, 2, 4, 12])
+def test_balls_of_other_sizes(ball):
+    # As many bright pixels as the ball has, around its state, or half a pixel more to the right and below
+    # where its size is even; and at 42 x 42 the mean of 2 x 2 pixels.
+    actions = np.random.default_rng(0).integers(0, 3, (40, 8))
+    large = record(envs.make(f"catch:ball={ball}", num_envs=8, seed=3), actions)
+    frames = np.concatenate([x for x in large if x.ndim == 3]).astype(float)
+    states = np.concatenate([x for x in large if x.shape == (8, 5)])
+    above = frames[:, :76]
+    assert (above > 0).sum((1, 2)).tolist() == [ball**2] * len(frames)
+    index, mass, shift = np.arange(84), above.sum((1, 2)), (ball + 1) % 2 / 2
+    np.testing.assert_allclose(above.sum(1) @ index / mass, states[:, 0] + shift)
+    np.testing.assert_allclose(above.sum(2) @ index[:76] / mass, states[:, 1] + shift)
+    small = record(envs.make(f"catch:ball={ball}", num_envs=8, seed=3, frame_size=42), actions)
+    means = [x.reshape(8, 42, 2, 42, 2).mean((2, 4)) if x.ndim == 3 else x for x in large]
+    assert same(means, small)
+
+
+# A paddle at 50 covers columns 44 to 56. A ball of 2 at 43 covers 43 and 44, one of 4 at 42 covers 41 to 44,
+# and at 57 it covers 56 to 59.
+@pytest.mark.parametrize(
+    ("ball", "column", "reward"),
+    [(1, 44, 1), (1, 43, -1), (1, 56, 1), (1, 57, -1), (2, 43, 1), (2, 42, -1), (2, 56, 1), (2, 57, -1)]
+    + [(4, 42, 1), (4, 41, -1), (4, 57, 1), (4, 58, -1)],
+)
+def test_a_catch_is_one_shared_column_for_every_ball(ball, column, reward):
+    env = envs.make(f"catch:ball={ball}", num_envs=1, seed=0)
+    put(env, ball_x=column, ball_y=75 - ball // 2 - 4, drift=0, fall=4, paddle=50)
+    frames, rewards, terminated, _, _ = env.step(np.array([NOOP]))
+    assert rewards[0] == reward and terminated[0]
+    assert ((frames[0, 75] > 0) & (frames[0, 76] > 0)).any() == (reward == 1)
+
+
+def behind(env):
+    """The environment, with nothing in front of its background."""
+    env._draw = lambda *args: None
+    return env
+
+
+def scrolled(env, action):
+    """By how many rows down, and columns to the right, each texture went in one env step: [N, layer, 2]."""
+    before = env._background.arrays()["background_offset"].copy()
+    env.step(np.full(env.num_envs, action))
+    after = env._background.arrays()["background_offset"]
+    return (before - after + catch.TORUS // 2) % catch.TORUS - catch.TORUS // 2
+
+
+@pytest.mark.parametrize("size", [84, 42])
+def test_a_static_background_changes_with_episodes_alone(size):
+    def pictures(policy):
+        env = behind(envs.make("catch:background=static", num_envs=3, seed=4, frame_size=size))
+        frames, _ = env.reset()
+        found = [[frame] for frame in frames]
+        for step in range(60):
+            frames, _, ended, _, _ = env.step(np.full(3, policy(step)))
+            assert all(np.array_equal(frame, seen[-1]) for frame, seen in zip(frames, found, strict=True))
+            if ended.any():
+                frames, _ = env.reset(options={"reset_mask": ended})
+                for i in np.flatnonzero(ended):
+                    found[i].append(frames[i])
+        return found
+
+    first, again = pictures(lambda step: step % 3), pictures(lambda step: LEFT)
+    assert min(map(len, first)) >= 3
+    for seen, other in zip(first, again, strict=True):
+        np.testing.assert_array_equal(seen, other)
+        assert (np.diff(np.array(seen, int), axis=0) != 0).any((1, 2)).all()
+    assert not np.array_equal(first[0], first[1][: len(first[0])])
+
+
+def test_a_moving_background_says_nothing_of_the_game():
+    # The hand-worked state of a sure catch and of a sure miss: the same scrolling.
+    found = []
+    for paddle in (50, 10):
+        env = envs.make("CatchDistractor", num_envs=4, seed=1)
+        put(env, ball_x=50, ball_y=40, drift=0, fall=3, paddle=paddle)
+        found.append(scrolled(env, NOOP))
+    np.testing.assert_array_equal(*found)
+    assert (found[0] != 0).all()
+
+
+@pytest.mark.parametrize("size", [84, 42])
+def test_a_background_of_the_reward_scrolls_to_the_right_where_a_paddle_that_stays_catches(size):
+    # 50 + 3 * 8 = 74 after 8 steps, at row 74. The paddle catches from 67 to 81; it goes on 4 columns a step.
+    env = envs.make("catch:background=reward", num_envs=3, seed=1, frame_size=size)
+    for paddle, action, right in ((70, NOOP, True), (66, NOOP, False), (63, RIGHT, True), (70, LEFT, False)):
+        put(env, ball_x=50, ball_y=50, drift=3, fall=3, paddle=paddle)
+        moved = scrolled(env, action)
+        assert (np.sign(moved[..., 1]) == (1 if right else -1)).all()
+        assert ((1 <= np.abs(moved)) & (np.abs(moved) <= catch.MAX_SCROLL)).all()
+    # With a wall on the way: 80 + 3 * 8 = 104, reflected at 82 to 60.
+    put(env, ball_x=80, ball_y=50, drift=3, fall=3, paddle=54)
+    assert (scrolled(env, NOOP)[..., 1] > 0).all()
+    # In the frames, too: each texture alone is the one of before, moved.
+    env = behind(envs.make("catch:background=reward", num_envs=1, seed=1, frame_size=84))
+    put(env, ball_x=50, ball_y=50, drift=3, fall=3, paddle=70)
+    env._background._layers[1] = np.zeros_like(env._background._layers[1])
+    before = env._frames()[0]
+    down, right = scrolled(env, NOOP)[0, 0]
+    after = env._frames()[0]
+    assert right > 0
+    np.testing.assert_array_equal(after[10:74, 10:74], before[10 - down : 74 - down, 10 - right : 74 - right])
+
+
+def test_the_last_scrolling_of_an_episode_is_that_of_its_reward():
+    env = envs.make("catch:background=reward", num_envs=50, seed=2)
+    env.reset()
+    rng, seen = np.random.default_rng(0), []
+    for _ in range(60):
+        before = env._background.arrays()["background_offset"].copy()
+        _, rewards, ended, _, _ = env.step(rng.integers(0, 3, 50))
+        moved = before - env._background.arrays()["background_offset"]
+        right = np.sign((moved[:, 0, 1] + catch.TORUS // 2) % catch.TORUS - catch.TORUS // 2)
+        np.testing.assert_array_equal(right[ended], rewards[ended])
+        seen += rewards[ended].tolist()
+        if ended.any():
+            env.reset(options={"reset_mask": ended})
+    assert {-1, 1} == set(seen)
+
+
+def test_every_background_has_the_same_balls_and_is_dark():
+    actions = np.random.default_rng(1).integers(0, 3, (40, 5))
+    runs = [
+        record(envs.make(f"catch:background={name}", num_envs=5, seed=9), actions) for name in BACKGROUNDS
+    ]
+    plain = [x for x in runs[0] if x.dtype != np.uint8]
+    for run in runs[1:]:
+        assert same(plain, [x for x in run if x.dtype != np.uint8])
+        for frame, bare in zip(run, runs[0], strict=True):
+            if frame.dtype == np.uint8:
+                assert (frame[bare > 0] == catch.BRIGHTNESS).all()
+                assert frame[bare == 0].max() <= 2 * catch.LAYER_BRIGHTNESS

@@ -1,7 +1,8 @@
-"""The table of games, and what `make` does with a name."""
+"""The registry of games: names, their canonical text, rows of one's own, and what `make` does with them."""
 
 import json
 import pathlib
+import re
 import subprocess
 import sys
 
@@ -9,12 +10,16 @@ import pytest
 
 from srl_jax import envs
 from srl_jax.envs import games
+from srl_jax.errors import ConfigError
+from srl_jax.specs import SpecError
+
+GYM = "gymnasium:id={},grey=false,render=false,frame_skip=1,max_steps=0"
 
 
 def test_the_57_games():
     assert len(games.ATARI_57) == len(set(games.ATARI_57)) == 57
     assert list(games.ATARI_57) == sorted(games.ATARI_57)
-    assert envs.GAMES == games.ATARI_57 + ("Catch", "CatchDistractor")
+    assert tuple(envs.NAMES) == games.ATARI_57 + ("Catch", "CatchDistractor")
     thesis = {"Breakout", "Enduro", "MsPacman", "Pong", "Qbert", "Seaquest", "SpaceInvaders"}
     assert thesis <= set(games.ATARI_57)
 
@@ -48,16 +53,126 @@ def test_every_rom_is_bundled():
     assert set(names) <= roms
 
 
-def test_make_refuses_an_unknown_name_and_lists_the_valid_ones():
-    with pytest.raises(ValueError, match="unknown game 'pong'.*Pong.*CatchDistractor"):
-        envs.make("pong", num_envs=1, seed=0)
+@pytest.mark.parametrize(
+    ("typed", "canonical"),
+    [
+        ("Pong", "Pong"),
+        ("atari:game=Pong", "Pong"),
+        ("Catch", "Catch"),
+        ("catch", "Catch"),
+        (" catch:background=none,ball=3 ", "Catch"),
+        ("catch:background=moving", "CatchDistractor"),
+        ("catch:background=static,ball=1e0", "catch:ball=1,background=static"),
+        ("gymnasium:id=MiniGrid-Empty-5x5-v0", GYM.format("MiniGrid-Empty-5x5-v0")),
+        ("my.module:ns/MyEnv-v0", GYM.format("my.module:ns/MyEnv-v0")),
+        ("my:E-v0,grey=1", GYM.format("my:E-v0").replace("grey=false", "grey=true")),
+    ],
+)
+def test_a_game_has_one_canonical_name(typed, canonical):
+    assert envs.canonical(typed) == canonical == envs.canonical(canonical)
+
+
+@pytest.mark.parametrize("name", envs.NAMES)
+def test_a_name_of_its_own_is_canonical(name):
+    assert envs.canonical(name) == name
+
+
+@pytest.mark.parametrize(
+    ("typed", "says"),
+    [
+        ("Pogn", "did you mean Pong? valid: an Atari-57 game (Pong, MsPacman, ...), Catch, "),
+        ("pong", "did you mean Pong?"),
+        ("ALE/Pong-v5", "did you mean Pong?"),
+        ("PongNoFrameskip-v4", "did you mean Pong?"),
+        ("MiniGrid-Empty-5x5-v0", "did you mean gymnasium:id=MiniGrid-Empty-5x5-v0?"),
+        ("cath:ball=2", "did you mean catch?"),
+        ("", "valid: an Atari-57 game"),
+        ("nothing:", "valid: an Atari-57 game"),
+        ("Catch:ball=2", "did you mean catch?"),
+        ("catch:bal=2", "catch has no option 'bal'; did you mean ball?"),
+        ("catch:ball=0", "ball must be at least 1 and at most 12 (pixels of a frame of 84 x 84)"),
+        ("catch:ball=13", "ball must be at least 1"),
+        ("catch:background=mving", "did you mean moving? valid: none, static, moving, reward"),
+        ("atari:game=Pogn", "'Pogn' is not one of the 57 Atari games; did you mean Pong?"),
+        ("gymnasium", "id is missing; write gymnasium:id=MiniGrid-Empty-5x5-v0, say"),
+        ("my:E v0", "id='my:E v0' is none"),
+        ("my:E-v0,gray=1", "gymnasium has no option 'gray'; did you mean grey?"),
+        ("my:E-v0,frame_skip=0", "frame_skip must be at least 1"),
+    ],
+)
+def test_what_is_no_game_is_refused_in_one_line(typed, says):
+    for call in (envs.game, envs.canonical, lambda text: envs.make(text, num_envs=1, seed=0)):
+        with pytest.raises(SpecError, match=rf"^--game=(gymnasium:id=)?{re.escape(typed)}: ") as raised:
+            call(typed)
+        assert says in str(raised.value)
+        assert "\n" not in str(raised.value) and len(str(raised.value)) < 250
+
+
+def test_a_list_that_was_cut_at_commas():
+    parts = "catch:ball=2,background=static,Pong,my:E-v0,grey=true,catch,Catch".split(",")
+    expected = ["catch:ball=2,background=static", "Pong", envs.canonical("my:E-v0,grey=true"), "Catch"]
+    assert envs.several(parts) == expected and envs.several([]) == []
+    with pytest.raises(SpecError, match="^--games=Pang: did you mean Pong"):
+        envs.several(["Pang"])
+
+
+def test_directories_of_games():
+    assert envs.file_name("Pong") == "Pong"
+    assert envs.file_name("catch:ball=2,background=static") == "catch_ball=2_background=static"
+    assert "/" not in envs.file_name("gymnasium:id=ns/E-v0")
+
+
+def test_what_rows_say_of_their_games():
+    pong, catch, own = (envs.game(text) for text in ("Pong", "catch:ball=2", "my:E-v0,frame_skip=3"))
+    assert (pong.frames_per_step, catch.frames_per_step, own.frames_per_step) == (4, 1, 3)
+    assert (pong.lives, catch.lives, own.lives) == (True, False, False)
+    assert {"sticky_actions", "noop_max"} <= set(pong.options) and catch.options == own.options == ()
+    assert (pong.kind, catch.kind, own.kind) == ("atari", "catch", "gymnasium my:E-v0")
+    assert catch.frame_sizes == (42, 84) and not pong.frame_sizes and not own.frame_sizes
+    assert (pong.presets, catch.presets, own.presets) == ("thesis", "small", "thesis")
+
+
+def test_a_row_of_ones_own(monkeypatch):
+    monkeypatch.setattr(games, "REGISTRY", dict(games.REGISTRY))
+    made = []
+
+    def factory(*, speed: int = 1):
+        if speed > 9:
+            raise ValueError("speed must be at most 9")
+        return envs.Game(make=lambda **options: made.append((speed, options)), scores=(0.0, 5.0))
+
+    envs.register("dot", factory)
+    envs.register("dot", factory)  # a file that is imported twice
+    assert envs.canonical("dot") == "dot:speed=1"
+    assert envs.game("dot").kind == "dot"
+    envs.make("dot:speed=2", num_envs=3, seed=4, sticky_actions=0.5)
+    assert made == [(2, {"num_envs": 3, "seed": 4, "frame_size": 84})]
+    with pytest.raises(SpecError, match="did you mean dot.*module:Name-v0, dot$"):
+        envs.game("dott")
+    with pytest.raises(SpecError, match="--game=dot:speed=10: speed must be at most 9"):
+        envs.game("dot:speed=10")
+    for name in ("dot", "catch", "Pong", "a:b", ""):
+        with pytest.raises(ValueError, match="already|letters, digits"):
+            envs.register(name, lambda: None)
+    with pytest.raises(TypeError, match="speed needs a bool, int, float or str default"):
+        envs.register("other", lambda *, speed: None)
+    assert "other" not in games.REGISTRY
+
+
+def test_make_names_the_game_that_cannot_be_made(monkeypatch):
+    def refuse(**options):
+        raise ConfigError("cannot be made: why")
+
+    monkeypatch.setattr(games, "REGISTRY", {**games.REGISTRY, "dot": lambda: envs.Game(make=refuse)})
+    with pytest.raises(ConfigError, match="^--game=dot: cannot be made: why$"):
+        envs.make("dot", num_envs=1, seed=0)
 
 
 def test_the_names_cost_no_import():
     code = (
-        "import json, sys; from srl_jax.envs import GAMES; "
-        "heavy = {'ale_py', 'jax', 'gymnasium', 'numpy'} & set(sys.modules); "
-        "print(json.dumps([len(GAMES), sorted(heavy)]))"
+        "import json, sys; from srl_jax import config, envs; config.Config(game='my:E-v0'); "
+        "heavy = {'ale_py', 'jax', 'gymnasium'} & set(sys.modules); "
+        "print(json.dumps([len(envs.NAMES), sorted(heavy)]))"
     )
     root = pathlib.Path(envs.__file__).parents[2]
     done = subprocess.run([sys.executable, "-c", code], cwd=root, capture_output=True, check=True)

@@ -20,7 +20,9 @@ def check(make, player, moment, moves):
     return snapshot
 
 
-@pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
+@pytest.mark.parametrize(
+    "game", ["Catch", "CatchDistractor", "catch:ball=4,background=static", "catch:ball=1,background=reward"]
+)
 @pytest.mark.parametrize("moment", MOMENTS)
 @settings(max_examples=10)
 @given(seed=st.integers(0, 2**63 - 1), before=st.integers(0, 80))

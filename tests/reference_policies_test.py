@@ -12,9 +12,10 @@ from experiments import flags as config_flags
 from experiments import reference_policies as played
 from srl_jax.config import Config
 from srl_jax.data import POLICIES, published, reference_policies
-from srl_jax.envs import ATARI_57, CATCH
+from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError
 
+CATCH = ("Catch", "CatchDistractor")
 THESIS = ("Breakout", "Enduro", "MsPacman", "Pong", "Qbert", "Seaquest", "SpaceInvaders")
 
 
@@ -134,6 +135,15 @@ def test_what_was_played_until_a_signal_is_kept(tmp_path, capsys, monkeypatch):
     assert _run("--games=Catch", "--episodes=2", f"--out={path}") == 128 + 15
     assert [row.policy for row in played._read(path)] == ["random"]
     assert "no-op" not in capsys.readouterr().out
+
+
+def test_a_game_without_an_action_that_does_nothing(tmp_path, capsys):
+    arguments = "--games=examples.own_environment:Dot-v0,grey=true", "--episodes=2", "--eval_max_steps=5"
+    with pytest.raises(ConfigError, match="--policies=no-op: gymnasium:id=.* has no action NOOP; valid"):
+        _run(*arguments)
+    (_, row) = csv.reader(capsys.readouterr().out.splitlines())  # it was played before
+    assert row[0].startswith("gymnasium:id=examples.own_environment:Dot-v0,grey=true")
+    assert row[1] == "random" and row[6:8] == ["", ""]  # it has no sticky actions, and no no-ops
 
 
 @pytest.mark.parametrize(

@@ -319,6 +319,16 @@ def test_what_only_atari_has_is_said_of_atari_alone(tmp_path):
     assert labels == ["env steps (4 frames each)", "env steps", "env steps"]
 
 
+def test_a_game_without_scores_of_others_has_numbers_of_its_own(tmp_path):
+    game = "gymnasium:id=A-v0,grey=true,render=false,frame_skip=1,max_steps=0"
+    for arm in "ab":
+        for seed in range(2):
+            write_run(tmp_path / f"x/{arm}/seed{seed}", (1.0, 2.0 + seed), seed=seed, game=game, gamma=0.9)
+    page = Page(build(tmp_path, media=False))
+    assert list(page.table(f"Statistics of {game}")) == ["arm", "a", "b"]
+    assert "No game with reference scores has runs of every arm" in page.text
+
+
 def test_other_protocols_are_refused_or_said(tmp_path):
     write_run(tmp_path / "a/seed0", [0.0, 1.0])
     write_run(tmp_path / "a/seed1", [0.0, 1.0], gamma=0.5, seed=1)

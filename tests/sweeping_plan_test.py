@@ -67,6 +67,18 @@ def test_seeds():
             plan.parse_seeds(text)
 
 
+def test_games_with_options_have_directories_of_their_own():
+    games = ["Pong", "catch:ball=1", "catch:background=moving"]
+    runs = plan.plan([arm_of("small/joint_256")], games, [0])
+    assert [(run.name, run.flags["game"]) for run in runs] == [
+        ("Pong/joint_256/seed0", "Pong"),
+        ("catch_ball=1_background=none/joint_256/seed0", "catch:ball=1,background=none"),
+        ("CatchDistractor/joint_256/seed0", "CatchDistractor"),
+    ]
+    with pytest.raises(ConfigError, match="--games=gymnasium:id=a/b-v0,.* of gymnasium:id=a:b-v0,.* do"):
+        plan.plan([arm_of("small/joint_256")], ["a:b-v0", "gymnasium:id=a/b-v0"], [0])
+
+
 def test_patterns_name_presets():
     assert plan.presets(["small/joint_5*", "catch/joint"]) == ["small/joint_50", "catch/joint"]
     assert len(plan.presets(["thesis/*"])) == sum(name.startswith("thesis/") for name in PRESETS)

@@ -5,9 +5,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from srl_jax import specs
+from srl_jax import envs, specs
 from srl_jax.config import INFOS, Config, history
-from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
@@ -159,18 +158,20 @@ def value_text(value: Any) -> str:
 
 
 def protocol_text(config: Config) -> str:
-    """How a policy was evaluated, in a line; what only Atari games have is said of these alone."""
+    """How a policy was evaluated, in a line; what a game does not have is not said of it."""
     sticky = f"sticky actions {config.sticky_actions:g}" if config.sticky_actions else "no sticky actions"
     noops = f"fewer than {config.noop_max} no-ops at the start" if config.noop_max > 1 else "no no-ops"
-    atari = config.game in ATARI_57
+    game = envs.game(config.game)
+    frames = f", of {game.frames_per_step} frames each" if game.frames_per_step > 1 else ""
     parts = [
         f"{config.eval_games} full games an evaluation, every {config.eval_every:,} env steps",
         f"epsilon {config.eps_eval:g}",
-        *([sticky, noops] if atari else []),
-        f"at most {config.eval_max_steps:,} env steps a game{', of 4 frames each' if atari else ''}",
+        *([sticky] if "sticky_actions" in game.options else []),
+        *([noops] if "noop_max" in game.options else []),
+        f"at most {config.eval_max_steps:,} env steps a game{frames}",
         *(
             [f"in training, a lost life ends {'the return' if config.life_loss else 'nothing'}"]
-            if atari
+            if game.lives
             else []
         ),
     ]

@@ -12,6 +12,7 @@ import numpy as np
 
 from srl_jax import statistics
 from srl_jax.config import Config
+from srl_jax.data import with_reference_scores
 from srl_jax.errors import ConfigError
 from srl_jax.specs import LIMITS
 
@@ -200,11 +201,12 @@ def profiles(
         arms: in their order.
 
     Returns:
-        The games that every arm with a policy has; thresholds [T], from just below the smallest score to the
-        largest; arm -> its profile [T]. No arm where there is no such game.
+        The games that every arm with a policy has and that have reference scores; thresholds [T], from just
+        below the smallest score to the largest; arm -> its profile [T]. No arm where there is no such game.
     """
     given = scores(comparisons, "final", arms)
     games = [game for game in comparisons if given and all(game in mine for mine in given.values())]
+    games = with_reference_scores(games)
     if not games:
         return [], np.zeros(0), {}
     normal = {

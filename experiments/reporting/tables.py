@@ -6,7 +6,14 @@ from typing import Any
 import numpy as np
 
 from srl_jax import statistics
-from srl_jax.data import POLICIES, Published, ReferencePolicy, published, reference_policies
+from srl_jax.data import (
+    POLICIES,
+    Published,
+    ReferencePolicy,
+    published,
+    reference_policies,
+    with_reference_scores,
+)
 from srl_jax.statistics import NARROW, Interval
 
 from . import numbers
@@ -161,7 +168,10 @@ def _over_games(report: Report) -> list:
         parts.append(tag("p", f"{title}, human-normalised{runs}:"))
         parts.append(table(head, body, f"{title}, over games"))
     if len(parts) == 1:
-        return [*parts, tag("p", "No game has runs of every arm, so nothing is aggregated.")]
+        return [
+            *parts,
+            tag("p", "No game with reference scores has runs of every arm, so nothing is aggregated."),
+        ]
     note = (
         "Human-normalised: 0 is a random policy, 1 a human; in Catch, a miss and a catch. The optimality gap "
         "is what is missing to 1. The probability of improvement is that of a run over one of "
@@ -173,7 +183,8 @@ def _over_games(report: Report) -> list:
 def _policies_over_games(report: Report, of: str) -> list:
     """Rows of policies that learn nothing, where each game with runs of every arm has them."""
     given = list(numbers.scores(report.comparisons, of, report.arms).values())
-    games = [game for game in report.comparisons if all(game in mine for mine in given)]
+    shared = [game for game in report.comparisons if all(game in mine for mine in given)]
+    games = with_reference_scores(shared)
     body = []
     for name in POLICIES:
         found = {game: reference_policies(game).get(name) for game in games}

@@ -8,9 +8,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from srl_jax import plugins
+from srl_jax import envs, plugins
 from srl_jax.config import INFOS
-from srl_jax.envs import GAMES
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
 
@@ -141,9 +140,11 @@ def plan(
                 f"arm {arm.name}: there twice, of {by_name[arm.name].preset} and of {arm.preset}; "
                 "give one of them another name"
             )
+    games = [envs.canonical(game, "games") for game in games]
+    directories = {envs.file_name(game): game for game in reversed(games)}
     for game in games:
-        if game not in GAMES:
-            raise ConfigError(f"--games={game}: {choices_text(game, GAMES)}")
+        if (other := directories[envs.file_name(game)]) != game:
+            raise ConfigError(f"--games={game}: its runs would lie where those of {other} do")
 
     runs: dict[str, Planned] = {}
 
@@ -165,7 +166,7 @@ def plan(
                         f" {source.preset}; give it another name"
                     )
                 sources[flag] = add(named, game, seed)
-        name = f"{game}/{arm.name}/seed{seed}"
+        name = f"{envs.file_name(game)}/{arm.name}/seed{seed}"
         runs[name] = Planned(name, arm.preset, {"game": game, "seed": str(seed), **own}, **sources)
         return name
 

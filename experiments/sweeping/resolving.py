@@ -66,9 +66,9 @@ def resolve_here(runs: Sequence[Planned]) -> dict[str, Config]:
     for run in runs:
         try:
             config = parsed(run)
-            check_extras(config)
             key = dataclasses.replace(config, seed=0)
             if key not in known:
+                check_extras(config)
                 known[key] = resolved(key)
             configs[run.name] = dataclasses.replace(known[key], seed=config.seed)
         except ConfigError as error:

@@ -11,6 +11,7 @@ from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 
@@ -84,8 +85,7 @@ def progress(run: Path, tail: int = TAIL) -> Progress:
 
 def keys(config: Config) -> tuple[tuple, tuple]:
     """What makes runs about as fast as each other: strictly, and where there is nothing better."""
-    kind = "Catch" if config.game.startswith("Catch") else "Atari"
-    loose = kind, config.encoder, config.mode
+    loose = envs.game(config.game).kind, config.encoder, config.mode
     return (*loose, config.batch_size, config.updates_per_step, config.srl_every, config.frame_size), loose
 
 

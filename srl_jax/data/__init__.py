@@ -8,7 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from srl_jax import envs
 from srl_jax.config import Config
+from srl_jax.errors import ConfigError
 
 
 class Published(NamedTuple):
@@ -80,7 +82,7 @@ class ReferencePolicy(NamedTuple):
     """What a policy that learns nothing scores in whole games; None: not known here, or the game has none.
 
     Attributes:
-        game: an Atari-57 game, Catch or CatchDistractor.
+        game: its canonical name, as config.json has it.
         policy: one of `POLICIES`.
         return_mean: raw score, the mean over games.
         return_std: standard deviation over games (n - 1).
@@ -180,15 +182,27 @@ def reference_scores(game: str) -> tuple[float, float]:
     """The raw scores that count as 0 and 1: a random policy's and a human's; a miss and a catch in Catch.
 
     Args:
-        game: an Atari-57 game, Catch or CatchDistractor.
+        game: an Atari-57 game, one of Catch's, or one whose row declares them, see `srl_jax.envs.Game`.
 
     Raises:
         ValueError: the game is none of them.
     """
-    scores = _reference_scores()
-    if game not in scores:
-        raise ValueError(f"no reference scores for game {game}; there are some for {', '.join(scores)}")
-    return scores[game]
+    if scores := _reference_scores().get(game) or _declared_scores(game):
+        return scores
+    known = ", ".join(_reference_scores())
+    raise ValueError(f"no reference scores for game {game}; there are some for {known}")
+
+
+def with_reference_scores(games: Iterable[str]) -> list[str]:
+    """Those of the games that `reference_scores` knows."""
+    return [game for game in games if game in _reference_scores() or _declared_scores(game)]
+
+
+def _declared_scores(game: str) -> tuple[float, float] | None:
+    try:
+        return envs.game(game).scores
+    except ConfigError:
+        return None
 
 
 def published(game: str) -> list[Published]:

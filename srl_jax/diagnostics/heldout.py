@@ -8,8 +8,6 @@ import numpy as np
 from srl_jax import envs
 from srl_jax.actor import seed_for
 from srl_jax.config import Config
-from srl_jax.data import ram_labels
-from srl_jax.envs import ATARI_57
 from srl_jax.replay import Replay
 from srl_jax.types import Window
 
@@ -86,6 +84,7 @@ def _collect(protocol: Protocol, horizon: int, number: int) -> HeldOut:
         frame_size=protocol.frame_size,
         sticky_actions=protocol.sticky_actions,
         noop_max=protocol.noop_max,
+        with_state=True,
     )
     rng = np.random.default_rng(seed_for(SEED, "held out", "policy"))
     # In each environment one of every STRIDE steps, but none in the last ones.
@@ -104,7 +103,6 @@ def _collect(protocol: Protocol, horizon: int, number: int) -> HeldOut:
         horizon=horizon,
         alpha=0.0,
     )
-    reader = _reader(protocol, env)
     everyone = np.arange(ENVS)
     episodes, next_episode = np.arange(ENVS), ENVS
     length = np.zeros(ENVS, int)
@@ -112,120 +110,30 @@ def _collect(protocol: Protocol, horizon: int, number: int) -> HeldOut:
     rows: list[tuple[int, np.ndarray, int]] = []
     frames, info = env.reset()
     replay.begin(frames)
-    reader.begin(np.ones(ENVS, bool), frames, info)
     for step, action in enumerate(actions):
         # An observation that is followed by a step of its episode: it always is, here.
         take = [i for i in everyone if due[i] < wanted.shape[1] and step >= wanted[i, due[i]]]
         for i in take:
             index = (replay.next_position[i] - 1) * ENVS + i
-            rows.append((int(index), reader.state(i), int(episodes[i])))
+            rows.append((int(index), info["state"][i] if env.state_names else (), int(episodes[i])))
             due[i] += 1
         frames, rewards, terminated, truncated, info = env.step(action)
         length += 1
         truncated |= (length >= LONGEST) & ~terminated
         replay.add(action, np.sign(rewards), terminated, truncated, info["life_lost"], frames)
         over = terminated | truncated
-        looked_at = [i for i in everyone if due[i] < wanted.shape[1] and step + 1 >= wanted[i, due[i]]]
-        reader.step(action, over, looked_at, frames, info)
         if over.any():
             frames, info = env.reset(options={"reset_mask": over})
             replay.begin(frames[over], np.flatnonzero(over))
-            reader.begin(over, frames, info)
             episodes[over] = next_episode + np.arange(over.sum())
             next_episode += int(over.sum())
             length[over] = 0
     env.close()
     indices, states, of_episode = zip(*[rows[i] for i in order], strict=True)
-    states = np.array(states, np.float64).reshape(number, -1)[:, : len(reader.variables)]
+    states = np.array(states if env.state_names else [()] * number, np.float64)
     held_out = HeldOut(
-        replay.gather(np.array(indices)), states, reader.variables, np.array(of_episode), reader.problem
+        replay.gather(np.array(indices)), states, env.state_names, np.array(of_episode), env.state_problem
     )
     for array in (*held_out.windows, held_out.states, held_out.episodes):
         array.setflags(write=False)
     return held_out
-
-
-class _Unknown:
-    """The state of a game that nobody has labelled.
-
-    Attributes:
-        variables: names of the numbers that `state` gives.
-        problem: what kept it from going on, or "".
-    """
-
-    variables: tuple[str, ...] = ()
-    problem = ""
-
-    def begin(self, mask: np.ndarray, frames: np.ndarray, info: dict) -> None:
-        """Episodes of the mask, bool [N], have begun."""
-
-    def step(self, actions: np.ndarray, over: np.ndarray, looked_at: list[int], frames, info: dict) -> None:
-        """All environments have moved; `looked_at` are those whose state may be asked for now."""
-
-    def state(self, env: int) -> np.ndarray:
-        """Of one environment, now: float64 [V]."""
-        return np.zeros(0)
-
-
-class _Told(_Unknown):
-    """The state is in `info`."""
-
-    def __init__(self, env):
-        self.variables = env.state_names
-
-    def begin(self, mask, frames, info):
-        self._states = info["state"]
-
-    def step(self, actions, over, looked_at, frames, info):
-        self._states = info["state"]
-
-    def state(self, env):
-        return self._states[env].astype(np.float64)
-
-
-class _Memory(_Unknown):
-    """The labelled bytes of the memory of emulators that are in step with the environments."""
-
-    def __init__(self, env, protocol: Protocol, labels: dict[str, int]):
-        from srl_jax.envs.ram import OutOfStep, Twin
-
-        self.variables, self._bytes = tuple(labels), list(labels.values())
-        self._env, self._out_of_step = env, OutOfStep
-        self._twins = [
-            Twin(protocol.game, sticky_actions=protocol.sticky_actions, noop_max=protocol.noop_max)
-            for _ in range(env.num_envs)
-        ]
-
-    def begin(self, mask, frames, info):
-        if self.problem:
-            return
-        for i in np.flatnonzero(mask):
-            seeded = self._env.steps_since_seeded[i] == 0
-            self._twins[i].reset(int(self._env.ale_seeds[i]) if seeded else None)
-            self._check(i, frames, info)
-
-    def step(self, actions, over, looked_at, frames, info):
-        if self.problem:
-            return
-        for i, twin in enumerate(self._twins):
-            twin.step(int(actions[i]), i in looked_at)
-        for i in looked_at:
-            if not over[i]:  # a game's last frame is older than its screen
-                self._check(i, frames, info)
-
-    def state(self, env):
-        return self._twins[env].ram()[self._bytes].astype(np.float64)
-
-    def _check(self, i, frames, info):
-        try:
-            self._twins[i].check(frames[i, :, :, 0], int(info["frame_number"][i]), int(info["lives"][i]))
-        except self._out_of_step as error:
-            self.problem = f"the emulator whose memory is read is out of step: {error}"
-            self.variables = ()
-
-
-def _reader(protocol: Protocol, env) -> _Unknown:
-    if protocol.game not in ATARI_57:
-        return _Told(env)
-    labels = ram_labels(protocol.game)
-    return _Memory(env, protocol, labels) if labels else _Unknown()

@@ -1,11 +1,41 @@
 """Environments: many copies of one game behind one small interface (see `base.FrameVectorEnv`).
 
-Importing this package imports none of gymnasium, ale_py or jax; `make` does.
+`REGISTRY[name](**options) -> Game`, a row for each kind of game; `register` adds one. Importing this package
+imports none of gymnasium, ale_py, numpy or jax; `make` does.
 """
 
-from srl_jax.envs.games import ATARI_57, CATCH, FRAME_SKIP, GAMES, MAX_FRAMES
+from srl_jax.envs.games import (
+    ATARI_57,
+    FRAME_SKIP,
+    MAX_FRAMES,
+    NAMES,
+    REGISTRY,
+    Game,
+    adapted,
+    canonical,
+    file_name,
+    game,
+    register,
+    several,
+)
+from srl_jax.envs.games import game as _game
+from srl_jax.errors import ConfigError
 
-__all__ = ["ATARI_57", "CATCH", "FRAME_SKIP", "GAMES", "MAX_FRAMES", "make"]
+__all__ = [
+    "ATARI_57",
+    "FRAME_SKIP",
+    "MAX_FRAMES",
+    "NAMES",
+    "REGISTRY",
+    "Game",
+    "adapted",
+    "canonical",
+    "file_name",
+    "game",
+    "make",
+    "register",
+    "several",
+]
 
 
 def make(
@@ -20,14 +50,15 @@ def make(
     max_frames: int = MAX_FRAMES,
     reseed_every: int = 5_000,
     num_threads: int = 0,
+    with_state: bool = False,
 ):
     """Makes `num_envs` copies of a game.
 
-    The options after `frame_size` are Atari's; Catch has nothing that they could change and ignores
-    them, so that one configuration serves every game.
+    The options after `frame_size` are Atari's; other games have nothing that they could change and ignore
+    them (`Game.options` says which a game takes), so that one configuration serves every game.
 
     Args:
-        game: one of `GAMES`.
+        game: see `games.parse`.
         num_envs: how many copies, N.
         seed: the source of all randomness; different seeds share no environment.
         frame_size: height and width of a frame in pixels; for Catch 84 or 42.
@@ -37,31 +68,28 @@ def make(
         max_frames: emulator frames (4 per env step) after which an episode is truncated.
         reseed_every: env steps between two seeded resets of one environment, see `atari.Atari`.
         num_threads: threads that step the emulators; 0 lets ALE choose.
+        with_state: `info["state"]` also where it takes time to know it: see `ram.AtariWithState`.
 
     Returns:
         A `base.FrameVectorEnv`.
 
     Raises:
-        ValueError: unknown game, or an option out of its range.
+        ConfigError: unknown game, or one that cannot be made, or whose frames nobody here can use.
+        ValueError: an option out of its range.
         ImportError: an Atari game without ale_py.
     """
-    if game in CATCH:
-        from srl_jax.envs.catch import Catch
-
-        return Catch(num_envs=num_envs, seed=seed, size=frame_size, distractor=game == "CatchDistractor")
-    if game in ATARI_57:
-        from srl_jax.envs.atari import Atari
-
-        return Atari(
-            game,
-            num_envs=num_envs,
-            seed=seed,
-            frame_size=frame_size,
-            sticky_actions=sticky_actions,
-            noop_max=noop_max,
-            full_action_space=full_action_space,
-            max_frames=max_frames,
-            reseed_every=reseed_every,
-            num_threads=num_threads,
-        )
-    raise ValueError(f"unknown game {game!r}; valid: {', '.join(GAMES)}")
+    given = {
+        "sticky_actions": sticky_actions,
+        "noop_max": noop_max,
+        "full_action_space": full_action_space,
+        "max_frames": max_frames,
+        "reseed_every": reseed_every,
+        "num_threads": num_threads,
+        "with_state": with_state,
+    }
+    row = _game(game)
+    known = {name: value for name, value in given.items() if name in row.options}
+    try:
+        return row.make(num_envs=num_envs, seed=seed, frame_size=frame_size, **known)
+    except ConfigError as error:
+        raise ConfigError(f"--game={game}: {error}") from error

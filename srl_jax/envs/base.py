@@ -1,4 +1,4 @@
-"""What Atari and Catch have in common: spaces, checks, seeds, who may be stepped, snapshots."""
+"""What all environments have in common: spaces, checks, seeds, who may be stepped, snapshots."""
 
 import hashlib
 import operator
@@ -49,10 +49,17 @@ class FrameVectorEnv(VectorEnv):
         single_observation_space: Box(uint8, (H, W, C)); C is 1 for grey, 3 for colour.
         single_action_space: Discrete(A).
         action_meanings: the A names of the actions.
+        state_names: of the numbers in `info["state"]`, float [N, V], the game's true state; () where it is
+            not known.
+        state_problem: why it is not known although it should be; empty where all is well.
     """
 
     # Not inherited: ale_py writes its own mode into the dict of gymnasium's base class.
     metadata = {"autoreset_mode": AutoresetMode.DISABLED}
+    state_names: tuple[str, ...] = ()
+    state_problem = ""
+    _restored_by = ""
+    """How `_restore` rebuilds the state, and what it means where that fails: follows the error."""
 
     def __init__(self, *, num_envs: int, seed: int, frame_shape: tuple, action_meanings: tuple):
         """Sets up the spaces and the seeds; `frame_shape` is (H, W, C).
@@ -192,7 +199,9 @@ class FrameVectorEnv(VectorEnv):
             differs = (array != arrays[name]).reshape(number, -1).any(1)
             if differs.any():
                 which = np.flatnonzero(differs).tolist()
-                raise ValueError(f"environments {which} cannot be rebuilt: not the snapshot's {name}")
+                raise ValueError(
+                    f"environments {which} cannot be rebuilt: not the snapshot's {name}" + self._restored_by
+                )
         self._ended = arrays["ended"].copy()
         self._started = True
         return frames

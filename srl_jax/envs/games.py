@@ -1,6 +1,19 @@
-"""The names of the games, and their time. Imports nothing heavy: a command line can be checked at once."""
+"""The registry of games: what the rest of the library has to know of each, and how its environments are made.
 
+Imports nothing heavy, so a command line can be checked at once: a row's factory only notes its options, and
+`Game.make` imports what the environments need.
+"""
+
+import dataclasses
+import functools
+import importlib.util
 import re
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from srl_jax import specs
+from srl_jax.errors import ConfigError
+from srl_jax.plugins import Registry
 
 FRAME_SKIP = 4
 """Emulator frames per env step."""
@@ -19,11 +32,257 @@ ATARI_57 = tuple(
 )
 """The 57 Atari games of Rainbow (Hessel et al., 2018) and Agent57, as Gymnasium spells them."""
 
-CATCH = ("Catch", "CatchDistractor")
-"""The games of `srl_jax.envs.catch`."""
+BACKGROUNDS = ("none", "static", "moving", "reward")
+"""What `--game=catch:background=` takes, see `srl_jax.envs.catch.Background`."""
 
-GAMES = (*ATARI_57, *CATCH)
-"""Every name that `srl_jax.envs.make` takes."""
+NAMES = {
+    **{game: f"atari:game={game}" for game in ATARI_57},
+    "Catch": "catch",
+    "CatchDistractor": "catch:background=moving",
+}
+"""Games with a name of their own, which config.json and tables of results have."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Game:
+    """What a row of the registry makes of its options: a game as an experiment sees it.
+
+    Attributes:
+        make: makes the environments, `make(num_envs=, seed=, frame_size=, **options) -> FrameVectorEnv` of
+            `srl_jax.envs.base`; imports what they need.
+        check: raises ConfigError, a reason that follows `--game=NAME: `, where the environments cannot be
+            made here, because something is not installed, say.
+        options: the names of the options of `srl_jax.envs.make` that `make` takes beside these three.
+        kind: what games have in common that take equally long; empty for the row's name.
+        frame_sizes: the values of --frame_size that it knows; empty for any.
+        own_size: whether --frame_size=0 leaves frames as large as they are.
+        frames_per_step: frames of the emulator in one env step.
+        lives: whether a life may be lost before the game is over.
+        scores: the raw scores that count as 0 and 1 where games are averaged; None: those of
+            `srl_jax.data.reference_scores`, or none.
+        presets: the family of presets that the thesis' figures are run with.
+    """
+
+    make: Callable[..., Any]
+    check: Callable[[], None] = lambda: None
+    options: tuple[str, ...] = ()
+    kind: str = ""
+    frame_sizes: tuple[int, ...] = ()
+    own_size: bool = False
+    frames_per_step: int = 1
+    lives: bool = False
+    scores: tuple[float, float] | None = None
+    presets: str = "thesis"
+
+
+def atari(*, game: str = "Pong") -> Game:
+    """An Atari 2600 game, see `srl_jax.envs.atari`; `--game=Pong` is short for `--game=atari:game=Pong`.
+
+    Args:
+        game: one of `ATARI_57`.
+    """
+    rom_name(game)
+
+    def make(**options):
+        from srl_jax.envs.atari import Atari
+
+        if not options.pop("with_state"):
+            return Atari(game, **options)
+        from srl_jax.envs.ram import AtariWithState
+
+        return AtariWithState(game, **options)
+
+    def check():
+        if importlib.util.find_spec("ale_py") is None:
+            raise ConfigError(
+                "Atari needs ale-py, pip install 'srl-jax[atari]'; valid without it: Catch, CatchDistractor"
+            )
+
+    options = ("sticky_actions", "noop_max", "full_action_space", "max_frames", "reseed_every", "num_threads")
+    return Game(make, check, (*options, "with_state"), frames_per_step=FRAME_SKIP, lives=True)
+
+
+def catch(*, ball: int = 3, background: str = "none") -> Game:
+    """A ball to be caught, see `srl_jax.envs.catch`; `Catch` and `CatchDistractor` stand for two of them.
+
+    Args:
+        ball: height and width of the ball in pixels of a frame of 84 x 84.
+        background: one of `BACKGROUNDS`.
+    """
+    if not 1 <= ball <= 12:
+        raise ValueError("ball must be at least 1 and at most 12 (pixels of a frame of 84 x 84)")
+    if background not in BACKGROUNDS:
+        raise ValueError(f"background={background}: {specs.choices_text(background, BACKGROUNDS)}")
+
+    def make(*, frame_size, **options):
+        from srl_jax.envs.catch import Catch
+
+        return Catch(size=frame_size, ball=ball, background=background, **options)
+
+    return Game(make, frame_sizes=(42, 84), scores=(-1.0, 1.0), presets="small")
+
+
+def gymnasium(
+    *, id: str = "", grey: bool = False, render: bool = False, frame_skip: int = 1, max_steps: int = 0
+) -> Game:
+    """Any gymnasium environment with discrete actions that shows images, see `srl_jax.envs.adapter`.
+
+    Its frames are resized to `--frame_size` squared (0: not), and `--frame_stack` of them are an observation.
+
+    Args:
+        id: that gymnasium.make takes; `module:Name-v0` imports the module first.
+        grey: reduces colours to their luma.
+        render: shows what the environment renders instead of what it observes (MiniGrid observes codes of
+            objects, which make a dark image, and renders colours).
+        frame_skip: steps of the environment in an env step, with the same action; their rewards are added.
+        max_steps: env steps after which an episode is truncated; 0 leaves that to the environment.
+    """
+    if not re.fullmatch(r"[\w:./-]+", id):
+        what = f"id={id!r} is none" if id else "id is missing"
+        raise ValueError(f"{what}; write gymnasium:id=MiniGrid-Empty-5x5-v0, say")
+
+    def make_one():
+        from srl_jax.envs.adapter import made
+
+        return made(id, render)
+
+    row = adapted(make_one, grey=grey, render=render, frame_skip=frame_skip, max_steps=max_steps)
+    return dataclasses.replace(row, kind=f"gymnasium {id}")
+
+
+def adapted(
+    make_one: Callable[[], Any],
+    *,
+    grey: bool = False,
+    render: bool = False,
+    frame_skip: int = 1,
+    max_steps: int = 0,
+) -> Game:
+    """The game of a gymnasium environment that is made by a function, for a row of one's own.
+
+        def dot(*, speed: int = 1):
+            return adapted(lambda: Dot(speed))
+
+        register("dot", dot)  # --game=dot:speed=2
+
+    Args:
+        make_one: () -> gymnasium.Env.
+        grey, render, frame_skip, max_steps: see `gymnasium`; render wants render_mode "rgb_array" of it.
+
+    Raises:
+        ValueError: frame_skip is 0.
+    """
+    if frame_skip < 1:
+        raise ValueError("frame_skip must be at least 1")
+    adaption = {"grey": grey, "render": render, "frame_skip": frame_skip, "max_steps": max_steps}
+
+    def make(**options):
+        from srl_jax.envs.adapter import Adapter
+
+        return Adapter(make_one, **adaption, **options)
+
+    def check():
+        make(num_envs=1, seed=0, frame_size=1).close()
+
+    return Game(make, check, own_size=True, frames_per_step=frame_skip)
+
+
+REGISTRY = Registry("envs", {"atari": atari, "catch": catch, "gymnasium": gymnasium})
+"""`REGISTRY[name](**options) -> Game`; keyword-only parameters are the options of `--game=name:key=value`.
+
+A row's factory is called wherever a game's name is read, so it should import nothing heavy.
+"""
+register = REGISTRY.register
+
+
+def parse(text: str, flag: str = "game") -> specs.Spec:
+    """Reads the name of a game: one of `NAMES`, `row:key=value,...`, or `module:Name-v0` for gymnasium.
+
+    Args:
+        text: what was typed.
+        flag: names the flag in errors, without dashes.
+
+    Raises:
+        SpecError: there is no such game; one line.
+    """
+    text = text.strip()
+    name, colon, rest = text.partition(":")
+    first, comma, options = rest.partition(",")
+    if text in NAMES:
+        text = NAMES[text]
+    elif name not in REGISTRY and first and "=" not in first:
+        text = f"gymnasium:id={name}:{first}{comma}{options}"
+    elif name not in REGISTRY:
+        raise specs.SpecError(f"--{flag}={' '.join(text.split())}: {_instead(name)}valid: {_kinds()}")
+    return specs.parse(text, REGISTRY, flag)
+
+
+def _kinds() -> str:
+    """What games there are, for errors."""
+    others = [name for name in REGISTRY if name not in ("atari", "catch", "gymnasium")]
+    kinds = (
+        "an Atari-57 game (Pong, MsPacman, ...)",
+        "Catch",
+        "CatchDistractor",
+        "catch:ball=2,background=moving",
+    )
+    return ", ".join((*kinds, "gymnasium:id=Name-v0", "module:Name-v0", *others))
+
+
+def _instead(name: str) -> str:
+    """`did you mean X? `, or nothing."""
+    stem = re.sub(r"(NoFrameskip|Deterministic)?-v\d+$", "", name.rpartition("/")[2])
+    close = specs.near(stem, [*NAMES, *REGISTRY])
+    if not close and stem != name:
+        close = [f"gymnasium:id={name}"]
+    return f"did you mean {close[0]}? " if close else ""
+
+
+def game(text: str, flag: str = "game") -> Game:
+    """The game of a name, see `parse`.
+
+    Raises:
+        SpecError: there is no such game, or its options do not fit together; one line.
+    """
+    spec = parse(text, flag)
+    row = specs.build(spec, REGISTRY)
+    return dataclasses.replace(row, kind=row.kind or spec.name)
+
+
+def canonical(text: str, flag: str = "game") -> str:
+    """The one way to write a game's name that config.json has: with every option, or the game's own name.
+
+    Raises:
+        SpecError: see `game`.
+    """
+    game(text, flag)
+    full = parse(text, flag).full
+    return _own_names().get(full, full)
+
+
+@functools.cache
+def _own_names() -> dict[str, str]:
+    return {specs.parse(text, REGISTRY).full: name for name, text in NAMES.items()}
+
+
+def several(parts: Iterable[str], flag: str = "games") -> list[str]:
+    """The names, as of `canonical`, of a list that was cut at every comma, those between options included.
+
+    Raises:
+        SpecError: see `game`.
+    """
+    whole: list[str] = []
+    for part in parts:
+        if whole and "=" in part.partition(":")[0]:
+            whole[-1] += f",{part}"
+        else:
+            whole.append(part)
+    return list(dict.fromkeys(canonical(text, flag) for text in whole))
+
+
+def file_name(text: str) -> str:
+    """A game's name as that of a directory."""
+    return re.sub(r"[^A-Za-z0-9._=-]+", "_", text)
 
 
 def rom_name(game: str) -> str:
@@ -36,5 +295,7 @@ def rom_name(game: str) -> str:
         ValueError: the game is not one of them.
     """
     if game not in ATARI_57:
-        raise ValueError(f"{game!r} is not one of the 57 Atari games: {', '.join(ATARI_57)}")
+        close = specs.near(game, ATARI_57)
+        suggestion = f"; did you mean {close[0]}?" if close else ""
+        raise ValueError(f"{game!r} is not one of the 57 Atari games{suggestion}")
     return re.sub(r"(?<!^)(?=[A-Z])", "_", game).lower()

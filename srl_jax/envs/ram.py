@@ -8,7 +8,10 @@ import ale_py
 import numpy as np
 from ale_py import roms
 
+from srl_jax.data import ram_labels
+from srl_jax.envs.atari import Atari
 from srl_jax.envs.games import FRAME_SKIP, rom_name
+from srl_jax.envs.pixels import averaged
 
 TOLERANCE = 1.0
 """Grey levels by which a frame may differ from the screen that is made smaller here: both are rounded."""
@@ -76,7 +79,7 @@ class Twin:
         """Compares with what the environment shows after the same step, where `look` was set.
 
         Args:
-            frame: uint8 [H, W].
+            frame: uint8 [H, W] or [H, W, 1].
             frame_number, lives: of its `info`.
 
         Raises:
@@ -89,19 +92,61 @@ class Twin:
         screen = np.max(self._screens, axis=0)
         if len(frame) > min(screen.shape):  # larger than the screen: ALE interpolates
             return
-        if (difference := np.abs(shrunk(screen, len(frame)) - frame).max()) > TOLERANCE:
+        if (
+            difference := np.abs(averaged(screen, len(frame)) - frame.reshape(len(frame), -1)).max()
+        ) > TOLERANCE:
             raise OutOfStep(f"a pixel differs by {difference:.1f} grey levels")
 
 
-def shrunk(screen: np.ndarray, size: int) -> np.ndarray:
-    """A screen [H, W] with H and W at least `size`, made smaller by averaging areas: float64 [size, size]."""
-    return _averages(_averages(screen, size).T, size).T
+class AtariWithState(Atari):
+    """N copies of an Atari game with emulators in step, whose labelled bytes of memory are its state.
 
+    `info["state"]` is float64 [N, V]. In every step the next environment in turn is compared with its
+    emulator; from the first difference on the state is not known: `state_problem` says why, and there are no
+    `state_names`. A snapshot cannot be restored here: the emulators in step are not in it.
 
-def _averages(values: np.ndarray, size: int) -> np.ndarray:
-    """Rows [L, ...] -> [size, ...], each the mean of an equal stretch, which may cut rows in parts."""
-    sums = np.concatenate((np.zeros((1, *values.shape[1:])), np.cumsum(values, axis=0, dtype=np.float64)))
-    edges = np.arange(size + 1) * len(values) / size
-    whole = np.minimum(edges.astype(int), len(values) - 1)
-    at_edges = sums[whole] + (edges - whole)[:, None] * values[whole]
-    return np.diff(at_edges, axis=0) * size / len(values)
+    Args:
+        game: one of `games.ATARI_57`; one that nobody has labelled has no state.
+        sticky_actions, noop_max: as of `atari.Atari`.
+        **options: the others of `atari.Atari`.
+    """
+
+    def __init__(self, game: str, *, sticky_actions: float = 0.0, noop_max: int = 30, **options):
+        super().__init__(game, sticky_actions=sticky_actions, noop_max=noop_max, **options)
+        labels = ram_labels(game)
+        self.state_names, self._bytes = tuple(labels), list(labels.values())
+        made = self.num_envs if labels else 0
+        self._twins = [Twin(game, sticky_actions=sticky_actions, noop_max=noop_max) for _ in range(made)]
+        self._turn = 0
+
+    def _reset(self, mask, seeded):
+        frames, info = super()._reset(mask, seeded)
+        for i in np.flatnonzero(mask) if self.state_names else ():
+            self._twins[i].reset(int(self.ale_seeds[i]) if self.steps_since_seeded[i] == 0 else None)
+            self._compare(i, frames, info)
+        return frames, info | {"state": self._state()}
+
+    def _step(self, actions):
+        frames, rewards, terminated, truncated, info = super()._step(actions)
+        self._turn = (self._turn + 1) % self.num_envs
+        for i, twin in enumerate(self._twins if self.state_names else ()):
+            twin.step(int(actions[i]), look=i == self._turn)
+        # A game's last frame is older than its screen.
+        if self.state_names and not (terminated | truncated)[self._turn]:
+            self._compare(self._turn, frames, info)
+        return frames, rewards, terminated, truncated, info | {"state": self._state()}
+
+    def _restore(self, arrays):
+        raise NotImplementedError
+
+    def _state(self):
+        return np.array([twin.ram()[self._bytes] for twin in self._twins], np.float64).reshape(
+            self.num_envs, -1
+        )
+
+    def _compare(self, i, frames, info):
+        try:
+            self._twins[i].check(frames[i], int(info["frame_number"][i]), int(info["lives"][i]))
+        except OutOfStep as error:
+            self.state_problem = f"the emulator whose memory is read is out of step: {error}"
+            self.state_names = ()

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 
+from srl_jax import data
 from srl_jax.statistics.aggregates import (
     AGGREGATES,
     Scores,
@@ -40,19 +41,21 @@ def summary(
 
     Returns:
         Rows with the keys arm, against (the baseline, or None), game (None: over all games that every arm
-        has), statistic, point, low, high (None: no interval), kind (see `Interval`), runs (their number in
-        words). Statistics: "return" of each game, unnormalised; `AGGREGATES` of human-normalised scores;
-        against the baseline "return_difference" of each game, "mean_difference" and so on, the arm's minus
-        the baseline's, and "probability_of_improvement". There is no row for what the arms do not share.
+        has and that have reference scores), statistic, point, low, high (None: no interval), kind (see
+        `Interval`), runs (their number in words). Statistics: "return" of each game, unnormalised;
+        `AGGREGATES` of human-normalised scores; against the baseline "return_difference" of each game,
+        "mean_difference" and so on, the arm's minus the baseline's, and "probability_of_improvement". There
+        is no row for what the arms do not share.
 
     Raises:
-        ValueError: the baseline is no arm, a game is not known, or what `mean` raises.
+        ValueError: the baseline is no arm, or what `mean` raises.
     """
     if baseline is not None and baseline not in arms:
         raise ValueError(f"baseline {baseline} is not one of the arms: {', '.join(arms)}")
     games = [
         game for game in next(iter(arms.values()), {}) if all(game in scores for scores in arms.values())
     ]
+    games = data.with_reference_scores(games)
     normal = {a: {g: human_normalised(g, scores[g]) for g in games} for a, scores in arms.items()}
     rows = []
 
