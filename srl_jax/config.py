@@ -193,7 +193,7 @@ class Config:
     frame_size: int = _value(
         int,
         84,
-        "height and width of a frame, to which others are resized, 0 for a gymnasium environment's own; Catch "
+        "height and width of a frame, to which others are resized; 0: a gymnasium environment's own; Catch "
         "knows 42 and 84",
         "pixels",
         minimum=0,

@@ -168,8 +168,8 @@ class Adapter(FrameVectorEnv):
             image = pixels.resized(image, self._frames.shape[1])
         elif image.shape != self._frames[i].shape:
             raise ConfigError(
-                f"shows images of {list(image.shape)} and of {list(self._frames[i].shape)}; --frame_size makes "
-                "them equal"
+                f"shows images of {list(image.shape)} and of {list(self._frames[i].shape)}; --frame_size=84, "
+                "say, makes them equal"
             )
         self._frames[i] = image
         if self.state_names:
