@@ -247,7 +247,18 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
     if differing := another_run(manifest.config, config):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
     if checkpoint.NUMBERS not in manifest.files:
+        if config.steps > there.steps:
+            raise ConfigError(
+                f"--steps={config.steps}: the run in {path} has ended after {manifest.env_steps} env steps and "
+                "left no replay to go on with; --keep_replay beside training keeps it"
+            )
         return manifest
+    if config.steps < manifest.env_steps:
+        raise ConfigError(
+            f"--steps={config.steps}: the run in {path} has done {manifest.env_steps} env steps already"
+        )
+    if config.steps != there.steps:
+        say(f"{path}: --steps was {there.steps} and is {config.steps}{_by_the_end(config)}")
     with contextlib.suppress(ConfigError):  # it informs and decides nothing
         if (ended := ending.read(path)) is not None and ended.status == "diverged":
             say(f"{path}: ended since {ended.reason}; the same code on the same machine gets there again")
@@ -264,8 +275,18 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
     return manifest
 
 
+def _by_the_end(config: Config) -> str:
+    """What of a run depends on how long it is, for the line that says that this has changed."""
+    found = []
+    if config.lr_final_share != 1.0:
+        found.append("learning rates fall to --lr_final_share by the new end")
+    if config.diagnostics and config.diagnostics_kept:
+        found.append("drift is measured against encoders spread over the new length")
+    return f"; {' and '.join(found)}" if found else ""
+
+
 @contextlib.contextmanager
-def going_on(path: Path, manifest: Manifest) -> Iterator[None]:
+def going_on(path: Path, manifest: Manifest, config: Config) -> Iterator[None]:
     """Holds the directory of a run that goes on; its config.json gets what has changed since it began.
 
     Raises:
@@ -274,7 +295,7 @@ def going_on(path: Path, manifest: Manifest) -> Iterator[None]:
     """
     with rundir.held(path):
         try:
-            record_changes(path, manifest.env_steps)
+            record_changes(path, manifest.env_steps, config)
         except OSError as error:
             raise SaveError(f"--out={path}: {error.strerror}") from None
         yield

@@ -1,7 +1,8 @@
 """Goes on with a run that was stopped or killed: `python -m experiments.resume runs/x`.
 
-Its config.json has all settings. What training takes beside them may follow: --policy_from of a run that lies
-elsewhere by now, --import, --tune_runtime.
+Its config.json has all settings. What may change follows: --steps, which also extends a run that has ended, if
+it was trained with --keep_replay; --stop_at_return; --policy_from of a run that lies elsewhere by now; --import;
+and --tune_runtime.
 """
 
 import os

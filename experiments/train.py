@@ -195,7 +195,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs) if resume else [None] * len(runs)
-    if all(m is not None and checkpoint.NUMBERS not in m.files for m in manifests):
+    if all(m and (checkpoint.NUMBERS not in m.files or m.env_steps >= config.steps) for m in manifests):
         print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
         return 0
     # A checkpoint has the encoder; the policy that others are pretrained on is read again.
@@ -209,8 +209,10 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
-            holding = going_on(directory, manifest) if manifest else run_directory(directory, its_config)
-            stack.enter_context(holding)
+            if manifest:
+                stack.enter_context(going_on(directory, manifest, its_config))
+            else:
+                stack.enter_context(run_directory(directory, its_config))
         caught = stack.enter_context(signals(again=interrupt))
         directories = [directory for directory, _ in runs]
         resumed = manifests if manifests[0] else None

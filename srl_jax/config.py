@@ -364,10 +364,15 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
 
 
+MAY_CHANGE = ("steps", "stop_at_return", "keep_replay", "keep_best", "imports")
+"""Fields that may change when a run is resumed: when it ends, what it leaves, where its plug-ins lie."""
+
+
 def another_run(there: Config, here: Config) -> str:
-    """`difference` of what makes two runs two: what they start from and import may lie elsewhere by now."""
+    """`difference` of what makes two runs two: neither `MAY_CHANGE` nor where the sources lie by now."""
     same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
-    return difference(there, dataclasses.replace(here, **same, imports=there.imports))
+    same |= {name: getattr(there, name) for name in MAY_CHANGE}
+    return difference(there, dataclasses.replace(here, **same))
 
 
 def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:
@@ -399,21 +404,27 @@ def changes(run: str | Path) -> dict[str, tuple[Any, Any]]:
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 
 
-def record_changes(run: str | Path, env_steps: int) -> None:
-    """Adds `changes` to a run's config.json, under "continued"; writes nothing where there are none.
+def record_changes(run: str | Path, env_steps: int, config: Config) -> None:
+    """Brings a run's config.json up to date: `MAY_CHANGE`, and `changes` under "continued".
+
+    Writes nothing where nothing has changed.
 
     Args:
         run: its directory, held by this process.
-        env_steps: from which it goes on.
+        env_steps: from which it is resumed.
+        config: that it is resumed with.
 
     Raises:
         ConfigError: config.json is not what training writes.
         OSError: it could not be written.
     """
-    if changed := {name: now for name, (_, now) in changes(run).items()}:
-        about, _ = _read(run)
-        continued = {"env_steps": env_steps, "started": _now(), "changed": changed}
-        _write(run, {**about, "continued": [*about.get("continued", []), continued]})
+    about, _ = _read(run)
+    values = json.loads(config.to_json())
+    settings = {name: values[name] for name in MAY_CHANGE if about.get(name, values[name]) != values[name]}
+    changed = {name: now for name, (_, now) in changes(run).items()}
+    if settings or changed:
+        continued = {"env_steps": env_steps, "started": _now(), "changed": changed, "settings": settings}
+        _write(run, {**about, **settings, "continued": [*about.get("continued", []), continued]})
 
 
 def _read(run: str | Path) -> tuple[dict[str, Any], dict[str, list[Any]]]:

@@ -236,6 +236,8 @@ class Seed:
                 raise
             reason = f"{type(error).__name__}: {error}"
             raise ConfigError(f"{where}: cannot be resumed from: {reason}") from None
+        if manifest.config.stop_at_return != self.config.stop_at_return:
+            self.solved = False
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         key = jax.random.wrap_key_data(learner.pop("key"))
         return real_copy(shapes._replace(params=params, key=key, **learner))

@@ -97,6 +97,26 @@ def test_another_configuration_is_refused_with_what_differs(tmp_path):
         to_resume(tmp_path / "run", other)
 
 
+def test_a_run_is_extended_and_says_what_depends_on_its_end(tmp_path, capsys):
+    run = tmp_path / "run"
+    (made,) = make(run, checkpoints=(100,))
+    longer = dataclasses.replace(CONFIG, steps=CONFIG.steps + 5, lr_final_share=CONFIG.lr_final_share)
+    assert to_resume(run, longer) == made
+    line = capsys.readouterr().err
+    assert f"--steps was {CONFIG.steps} and is {CONFIG.steps + 5}" in line and "learning rates" not in line
+    with going_on(run, made, longer):
+        pass
+    said = json.loads((run / "config.json").read_text())
+    assert Config.load(run) == longer and said["continued"][-1]["settings"] == {"steps": longer.steps}
+    with pytest.raises(ConfigError, match="^--steps=99: the run in .* has done 100 env steps already"):
+        to_resume(run, dataclasses.replace(CONFIG, steps=99))
+    # One that has ended without its replay cannot be.
+    checkpoint.slim(made)
+    assert to_resume(run, longer).files.keys() == {"params.msgpack"}
+    with pytest.raises(ConfigError, match="has ended after 100 env steps and left no replay.*--keep_replay"):
+        to_resume(run, dataclasses.replace(longer, steps=longer.steps + 1))
+
+
 def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.setenv("XLA_FLAGS", "--a")
     monkeypatch.delenv("NPROC", raising=False)
@@ -104,7 +124,7 @@ def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
     (made,) = make(run, checkpoints=(100,))
     began = json.loads((run / "config.json").read_text())
     assert to_resume(run, CONFIG) == made
-    with going_on(run, made):
+    with going_on(run, made, made.config):
         pass
     assert capsys.readouterr().err == "" and json.loads((run / "config.json").read_text()) == began
 
@@ -121,7 +141,7 @@ def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
         f"was '--a' and is '--b', cpus was 99 and is {cpus}, numpy was None and is {numpy!r}, NPROC was None "
         "and is '3': results may differ from those of a run that did not end\n"
     )
-    with going_on(run, made), pytest.raises(ConfigError, match="is writing there"):
+    with going_on(run, made, made.config), pytest.raises(ConfigError, match="is writing there"):
         to_resume(run, CONFIG)
     said = json.loads((run / "config.json").read_text())
     assert said["versions"]["jax"] == "0.1" and Config.load(run) == CONFIG

@@ -192,6 +192,19 @@ def test_a_return_that_ends_a_run_ends_it_all_the_same(tmp_path, monkeypatch, st
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
+@pytest.mark.parametrize("steps", [104, 120])
+def test_a_finished_run_that_is_extended_is_the_run_that_was_longer(whole, tmp_path, steps):
+    # After 120 env steps an evaluation is under way when the run ends.
+    config, whole_path, whole_end = whole("rl_only")
+    path, shorter = tmp_path / "run", dataclasses.replace(config, steps=steps, keep_replay=True)
+    result, _ = go(shorter, path)
+    assert not result.interrupted and result.env_steps == steps
+    result, end = resume(config, path)
+    assert not result.interrupted and result.env_steps == 200
+    assert end == whole_end and rows(path) == rows(whole_path)
+    assert files(path)[0] == files(whole_path)[0]
+
+
 def test_chunks_of_frames_that_nothing_was_written_to_are_links(tmp_path, monkeypatch):
     # Streams of 100 slots, chunks of 8 slots: from 104 to 156 env steps, 13 to 15 slots of each are written.
     monkeypatch.setattr(replay, "CHUNK_BYTES", 8 * 4 * 42 * 42)
