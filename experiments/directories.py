@@ -249,8 +249,8 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
     if checkpoint.NUMBERS not in manifest.files:
         if config.steps > there.steps:
             raise ConfigError(
-                f"--steps={config.steps}: the run in {path} has ended after {manifest.env_steps} env steps and "
-                "left no replay to go on with; --keep_replay beside training keeps it"
+                f"--steps={config.steps}: the run in {path} has ended after {manifest.env_steps} env steps "
+                "and left no replay to go on with; --keep_replay beside training keeps it"
             )
         return manifest
     if config.steps < manifest.env_steps:
