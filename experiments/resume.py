@@ -1,7 +1,7 @@
 """Goes on with a run that was stopped or killed: `python -m experiments.resume runs/x`.
 
-Its config.json has all settings. What may change follows: --steps, which also extends a run that has ended, if
-it was trained with --keep_replay; --stop_at_return; --policy_from of a run that lies elsewhere by now; --import;
+Its config.json has all settings. What may change follows: --steps, which also extends a run that has ended if
+it was trained with --keep_replay; --stop_at_return; --policy_from of a run that lies elsewhere; --import;
 and --tune_runtime.
 """
 

@@ -47,6 +47,8 @@ ARMS = {
     "YarsRevenge, sticky": ("--sticky_actions=0.25",),
     "Seaquest, sticky": ("--sticky_actions=0.25",),
     "MsPacman, pretrain": ("--mode=pretrain",),
+    "Catch, three seeds": ("--seeds=0,1,2",),
+    "Pong, two seeds": ("--seeds=0,1",),
 }
 """{name: flags}; the game is the name's first word."""
 
@@ -136,7 +138,8 @@ def reference(out: Path, flags: tuple[str, ...], environment: dict) -> dict:
 
 def ended(out: Path) -> dict:
     """What a run that has ended left."""
-    rows = [strip_wall(row) for row in read_metrics(out / "metrics.jsonl")]
+    files = sorted([*out.glob("metrics.jsonl"), *out.glob("seed*/metrics.jsonl")])
+    rows = [strip_wall(row) for file in files for row in read_metrics(file)]
     return {"digest": json.loads(Path(f"{out}.digest").read_text(encoding="utf-8")), "rows": rows}
 
 
