@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax import checkpoint, ending, schedules
+from srl_jax import checkpoint, ending
 from srl_jax.actor import make_env, yielding_threads
 from srl_jax.agent import Agent, make_agent, over_seeds
 from srl_jax.checkpoint import Manifest
@@ -26,10 +26,10 @@ from srl_jax.diagnostics.pictures import pictures
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.loading import given_policy, greedy_policy, initial_params
-from srl_jax.schedules import passed
+from srl_jax.schedules import Now, Schedules, passed
 from srl_jax.seed import Seed, Step
 from srl_jax.types import Params
-from srl_jax.update import Hyper, named_key
+from srl_jax.update import named_key
 
 FETCH_EVERY = 100
 """Updates after which their metrics are fetched from the device, so that few wait there between two rows."""
@@ -147,7 +147,7 @@ class Run:
             Seed(own, Path(out), self.agent, env, progress and i == 0)
             for i, (own, out, env) in enumerate(zip(configs, outs, envs, strict=True))
         ]
-        self.learning_rates = {name: float(x) for name, x in self.agent.hyper.learning_rates.items()}
+        self.schedules = Schedules(config, self.agent.hyper)
         self.act_keys = [named_key(seed.key, "act") for seed in self.seeds]
         if policy := given_policy(config, frame, num_actions):
             for seed in self.seeds:
@@ -194,7 +194,7 @@ class Run:
             results = []
             for i, seed in enumerate(self.seeds):
                 params = self.device.part(self.state.params, i)
-                drawn = pictures(self.agent, params, seed.replay, self.beta)
+                drawn = pictures(self.agent, params, seed.replay, self.now.beta)
                 results.append(Result(self.env_steps, self.updates, not finished, drawn, seed.recording))
         return results
 
@@ -240,31 +240,17 @@ class Run:
             seed.begin()
 
     @property
-    def epsilon(self) -> float:
-        """The behaviour policy's, now."""
-        return schedules.epsilon(self.config, self.env_steps)
-
-    @property
-    def beta(self) -> float:
-        """The importance weights' exponent, now."""
-        return schedules.beta(self.config, self.env_steps)
-
-    @property
-    def hyper(self) -> Hyper:
-        """The numbers of the next update."""
-        if self.config.lr_final_share == 1.0:
-            return self.agent.hyper
-        rates = schedules.learning_rates(self.config, self.learning_rates, self.env_steps)
-        return self.agent.hyper._replace(learning_rates=rates)
+    def now(self) -> Now:
+        """The numbers of the schedules, now."""
+        return self.schedules.at(self.env_steps)
 
     def step(self) -> None:
         """One step of every environment, and the updates that are due."""
         frames = [seed.stacks.observations() for seed in self.seeds]
-        stepping = self.env_threads.submit(
-            self.act_and_step, self.state.params, frames, self.env_steps, self.epsilon
-        )
+        now = self.state.params, frames, self.env_steps, self.now.epsilon
+        stepping = self.env_threads.submit(self.act_and_step, *now)
         if all(len(seed.replay) for seed in self.seeds):
-            for _ in range(schedules.updates_due(self.config, self.env_steps) - self.updates):
+            for _ in range(self.schedules.updates_due(self.env_steps) - self.updates):
                 self.update()
         for seed, step in zip(self.seeds, stepping.result(), strict=True):
             seed.take(step)
@@ -283,10 +269,11 @@ class Run:
 
     def update(self) -> None:
         """One update, from sampling windows to setting their priorities; waits for the device."""
-        sampled = [seed.replay.sample(self.config.batch_size, self.beta) for seed in self.seeds]
+        _, beta, hyper = self.now
+        sampled = [seed.replay.sample(self.config.batch_size, beta) for seed in self.seeds]
         rl_alone = self.updates % self.config.srl_every
         update = self.device.update_rl if rl_alone else self.device.update
-        self.state, td_errors, metrics = update(self.state, [window for window, _ in sampled], self.hyper)
+        self.state, td_errors, metrics = update(self.state, [window for window, _ in sampled], hyper)
         self.updates += 1
         if self.agent.follow_every and self.updates % self.agent.follow_every == 0:
             self.state = self.device.follow(self.state)
@@ -332,7 +319,8 @@ class Run:
         """A "train" row of each seed: schedules, and means since the last one."""
         self.check_losses()
         for seed in self.seeds:
-            values = {"epsilon": self.epsilon, "beta": self.beta, "replay/transitions": len(seed.replay)}
+            epsilon, beta, _ = self.now
+            values = {"epsilon": epsilon, "beta": beta, "replay/transitions": len(seed.replay)}
             seed.report.train_row(self.env_steps, self.updates, values)
 
     def start_evaluation(self) -> None:
@@ -354,7 +342,8 @@ class Run:
             return {}
         self.check_losses()
         state = self.device.part(self.state, i)
-        values = seed.diagnostics.measure(state, self.env_steps, seed.replay, self.beta, self.hyper)
+        _, beta, hyper = self.now
+        values = seed.diagnostics.measure(state, self.env_steps, seed.replay, beta, hyper)
         if self.env_steps in seed.diagnostics.steps:
             parts = seed.diagnostics.parts(state.params)
             seed.save_parameters(parts, self.env_steps, self.updates, folder="encoders", keep=0)

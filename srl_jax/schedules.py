@@ -1,39 +1,67 @@
-"""The numbers of a run that change with its env steps: pure functions of a configuration and a count."""
+"""The numbers of a run that change with its env steps: functions of a configuration and a count."""
+
+from typing import NamedTuple
 
 import numpy as np
 
 from srl_jax.actor import linear
 from srl_jax.config import Config
 from srl_jax.modes import MODES
+from srl_jax.update import Hyper
 
 
-def epsilon(config: Config, env_steps: int) -> float:
-    """The behaviour policy's epsilon; without RL, 1 or, of a given policy, `pretrain_epsilon`."""
-    if not MODES[config.mode].rl:
-        return config.pretrain_epsilon if config.policy_from else 1.0
-    return linear(config.eps_train, config.eps_final, config.eps_anneal_steps, env_steps)
+class Now(NamedTuple):
+    """The numbers of one moment.
 
-
-def beta(config: Config, env_steps: int) -> float:
-    """The exponent of the importance weights (Schaul et al. 2016, section 3.4)."""
-    return linear(config.beta, config.beta_final, config.beta_anneal_steps, env_steps)
-
-
-def learning_rates(config: Config, rates: dict[str, float], env_steps: int) -> dict[str, np.float32]:
-    """Learning rates on their way to `lr_final_share` of what they are in `rates`."""
-    left = linear(1.0, config.lr_final_share, config.steps, env_steps)
-    return {name: np.float32(rate * left) for name, rate in rates.items()}
-
-
-def updates_due(config: Config, env_steps: int) -> int:
-    """Updates that are due by the end of the step that starts now, since the start of the run.
-
-    There are `updates_per_step` for each env step since learning began; the first comes with the first step
-    after `learn_start`.
+    Attributes:
+        epsilon: of the behaviour policy.
+        beta: the exponent of the importance weights (Schaul et al. 2016, section 3.4).
+        hyper: the numbers of an update.
     """
-    if env_steps < config.learn_start:
-        return 0
-    return int((env_steps - config.learn_start + config.num_envs) * config.updates_per_step + 1e-9)
+
+    epsilon: float
+    beta: float
+    hyper: Hyper
+
+
+class Schedules:
+    """The schedules of a run.
+
+    Args:
+        config: of the run.
+        hyper: the numbers of an update, with learning rates as they are at the start.
+    """
+
+    def __init__(self, config: Config, hyper: Hyper):
+        self._config, self._hyper = config, hyper
+        self._rates = {name: float(rate) for name, rate in hyper.learning_rates.items()}
+
+    def at(self, env_steps: int) -> Now:
+        """The numbers at an env step.
+
+        Without RL, epsilon is 1 or, of a given policy, `pretrain_epsilon`. Learning rates fall linearly to
+        `lr_final_share` of what they were.
+        """
+        c, hyper = self._config, self._hyper
+        epsilon = linear(c.eps_train, c.eps_final, c.eps_anneal_steps, env_steps)
+        if not MODES[c.mode].rl:
+            epsilon = c.pretrain_epsilon if c.policy_from else 1.0
+        if c.lr_final_share != 1.0:
+            left = linear(1.0, c.lr_final_share, c.steps, env_steps)
+            rates = {name: np.float32(rate * left) for name, rate in self._rates.items()}
+            hyper = hyper._replace(learning_rates=rates)
+        return Now(epsilon, linear(c.beta, c.beta_final, c.beta_anneal_steps, env_steps), hyper)
+
+    def updates_due(self, env_steps: int) -> int:
+        """Updates that are due by the end of the step that starts then, since the start of the run.
+
+        There are `updates_per_step` for each env step since learning began; the first comes with the first
+        step after `learn_start`.
+        """
+        c = self._config
+        if env_steps < c.learn_start:
+            return 0
+        return int((env_steps - c.learn_start + c.num_envs) * c.updates_per_step + 1e-9)
 
 
 def passed(before: int, now: int, every: int) -> bool:

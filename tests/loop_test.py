@@ -16,7 +16,7 @@ import pytest
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
-from srl_jax import actor, checkpoint, ending, loading, loop, schedules
+from srl_jax import actor, checkpoint, ending, loading, loop
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
@@ -26,7 +26,9 @@ from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.modes import ENCODER_OPTIMIZERS
 from srl_jax.replay import Replay
 from srl_jax.reporting import Report
+from srl_jax.schedules import Schedules
 from srl_jax.types import Window
+from srl_jax.update import Hyper
 from tests.helpers import JOINT, SMALL, identical, one_run
 
 
@@ -564,7 +566,8 @@ def test_config_is_data(joint):
 def test_learning_rates_fall_linearly_to_the_share_that_is_left():
     def at(env_steps, share):
         config = Config(**{**SMALL, "steps": 200, "lr_final_share": share})
-        rates = schedules.learning_rates(config, {"encoder": 0.0, "rl": 4e-3}, env_steps)
+        hyper = Hyper({}, {name: np.float32(rate) for name, rate in (("encoder", 0.0), ("rl", 4e-3))})
+        rates = Schedules(config, hyper).at(env_steps).hyper.learning_rates
         assert all(rate.dtype == np.float32 for rate in rates.values())
         return rates
 

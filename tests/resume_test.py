@@ -234,7 +234,7 @@ OF_A_RUN = {
     "in the checkpoint": {"state", "env_steps", "updates", "seeds"},
     "in metrics.jsonl before one is written": {"evaluating", "waiting"},
     "of the configuration": {
-        "config", "checkpoint_every", "agent", "device", "learning_rates", "act_keys", "stop",
+        "config", "checkpoint_every", "agent", "device", "schedules", "act_keys", "stop",
     },
     "of the process": {"env_threads", "eval_threads", "left", "resumed"},
 }  # fmt: skip
