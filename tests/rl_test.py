@@ -281,21 +281,29 @@ def test_an_option_of_a_distribution_is_refused_without_one():
             rl.rainbow(CONTEXT, distributional=False, **options)
 
 
-@pytest.mark.parametrize(("distributional", "row"), [(True, "c51"), (False, "dqn")])
-def test_rainbow_without_its_parts_is_the_row(distributional, row):
-    nothing = dict.fromkeys(("double", "dueling", "noisy", "prioritized"), False)
-    whole = rl.rainbow(CONTEXT, distributional=distributional, n_step=1, hidden=8, **nothing)
-    row = rl.REGISTRY[row](CONTEXT, hidden=8)
+OTHER = {"atoms": ATOMS, "v_min": -2.0, "v_max": 4.0, "init_std": 1.5, "priority": "kl"}
+"""No option of a distribution at its default."""
+
+
+@pytest.mark.parametrize("double", [True, False])
+@pytest.mark.parametrize(("row", "options"), [("c51", OTHER), ("dqn", {})])
+def test_rainbow_is_the_row_with_its_parts(row, options, double):
+    options = options | {"double": double, "dueling": True, "noisy": True, "prioritized": True, "n_step": 3}
+    options |= {"noisy_std": 0.3, "alpha": 0.7, "hidden": 8}
+    whole = rl.rainbow(CONTEXT, distributional=row == "c51", **options)
+    row = rl.REGISTRY[row](CONTEXT, **options)
     assert facts(whole) == facts(row)
-    head, slow_head = (random_params(row.objective.init, seed) for seed in (1, 2))
+    heads = [jit(algorithm.objective.init)(jax.random.key(0)) for algorithm in (whole, row)]
+    assert identical(*heads)
+    slow_head = random_params(row.objective.init, 2)
     online, slow, window = make_case()
 
     @jit
-    def both(online, slow):
+    def run(head, online, slow):
         arguments = head, slow_head, make_latents(online, slow), window, jax.random.key(0)
         return [algorithm.objective.loss(*arguments) for algorithm in (whole, row)]
 
-    assert identical(*both(online, slow))
+    assert identical(*run(heads[0], online, slow))
 
 
 def test_head_of_the_thesis_has_its_size():
