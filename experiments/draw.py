@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from absl import flags
 
+from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.data import reference_policies, thesis_curve
 from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
@@ -55,7 +56,9 @@ def draw_run(
         return []
     rows = read_rows(run / "metrics.jsonl")
     figures = run / "figures"
-    title = f"{config.game}, {config.mode}, {config.encoder.partition(':')[0]}, seed {config.seed}"
+    title = (
+        f"{envs.label(config.game)}, {config.mode}, {config.encoder.partition(':')[0]}, seed {config.seed}"
+    )
     reference, game = _reference(config, thesis) if thesis else None, config.game
     policies = {name: row.return_mean for name, row in reference_policies(game).items()}
     curve = figures / "learning_curve.png"

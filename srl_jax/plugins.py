@@ -20,7 +20,7 @@ import os
 import sys
 import traceback
 import zlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -34,11 +34,12 @@ class Registry(dict[str, Callable]):
     Args:
         kind: of what it has rows, as its package is called: "objectives".
         rows: the package's own.
+        reserved: names that mean something else already.
     """
 
-    def __init__(self, kind: str, rows: Mapping[str, Callable]):
+    def __init__(self, kind: str, rows: Mapping[str, Callable], reserved: Collection[str] = ()):
         super().__init__(rows)
-        self.kind = kind
+        self.kind, self._reserved = kind, reserved
         self._origins: dict[str, str] = {}
 
     def register(self, name: str, factory: Callable | None = None) -> Callable:
@@ -65,7 +66,7 @@ class Registry(dict[str, Callable]):
             raise ConfigError(f"srl_jax.{self.kind} takes no row {name!r}: {error}") from None
         origin = _origin(factory)
         # A module that is imported a second time, by another name, says the same again.
-        if super().__contains__(name) and self._origins.get(name) != origin:
+        if name in self._reserved or (super().__contains__(name) and self._origins.get(name) != origin):
             whose = self._origins.get(name, "the package itself")
             raise ConfigError(
                 f"{origin} registers {name!r} in srl_jax.{self.kind}, where {whose} has a row of that name; "

@@ -5,12 +5,14 @@ import pathlib
 import re
 import subprocess
 import sys
+from functools import partial
 
 import pytest
 
 from srl_jax import envs
 from srl_jax.envs import games
 from srl_jax.errors import ConfigError
+from srl_jax.plugins import Registry
 from srl_jax.specs import SpecError
 
 GYM = "gymnasium:id={},grey=false,render=false,frame_skip=1,max_steps=0"
@@ -133,16 +135,17 @@ def test_what_rows_say_of_their_games():
 
 
 def test_a_row_of_ones_own(monkeypatch):
-    monkeypatch.setattr(games, "REGISTRY", dict(games.REGISTRY))
-    made = []
+    registry = Registry("envs", games.REGISTRY, games.NAMES)
+    monkeypatch.setattr(games, "REGISTRY", registry)
+    register, made = registry.register, []
 
     def factory(*, speed: int = 1):
         if speed > 9:
             raise ValueError("speed must be at most 9")
         return envs.Game(make=lambda **options: made.append((speed, options)), scores=(0.0, 5.0))
 
-    envs.register("dot", factory)
-    envs.register("dot", factory)  # a file that is imported twice
+    register("dot", factory)
+    register("dot", factory)  # a file that is imported twice
     assert envs.canonical("dot") == "dot:speed=1"
     assert envs.game("dot").kind == "dot"
     envs.make("dot:speed=2", num_envs=3, seed=4, sticky_actions=0.5)
@@ -152,11 +155,11 @@ def test_a_row_of_ones_own(monkeypatch):
     with pytest.raises(SpecError, match="--game=dot:speed=10: speed must be at most 9"):
         envs.game("dot:speed=10")
     for name in ("dot", "catch", "Pong", "a:b", ""):
-        with pytest.raises(ValueError, match="already|letters, digits"):
-            envs.register(name, lambda: None)
-    with pytest.raises(TypeError, match="speed needs a bool, int, float or str default"):
-        envs.register("other", lambda *, speed: None)
-    assert "other" not in games.REGISTRY
+        with pytest.raises(ConfigError, match="has a row of that name|letters, digits"):
+            register(name, partial(dict))
+    with pytest.raises(ConfigError, match="speed needs a bool, int, float or str default"):
+        register("other", lambda *, speed: None)
+    assert "other" not in registry
 
 
 def test_make_names_the_game_that_cannot_be_made(monkeypatch):
@@ -187,3 +190,16 @@ def test_without_ale_py_the_error_says_what_to_install(monkeypatch):
     with pytest.raises(ImportError, match=r"pip install srl-jax\[atari\]"):
         envs.make("Pong", num_envs=1, seed=0)
     assert envs.make("Catch", num_envs=1, seed=0).num_envs == 1
+
+
+@pytest.mark.parametrize(
+    ("game", "label"),
+    [
+        ("Pong", "Pong"),
+        ("catch:background=moving", "CatchDistractor"),
+        ("catch:ball=2", "catch:ball=2"),
+        ("gymnasium:grey=false,id=A-v0,frame_skip=2", "gymnasium:id=A-v0,frame_skip=2"),
+    ],
+)
+def test_a_label_leaves_out_what_is_as_always(game, label):
+    assert envs.label(game) == label

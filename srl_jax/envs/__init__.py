@@ -15,6 +15,7 @@ from srl_jax.envs.games import (
     canonical,
     file_name,
     game,
+    label,
     register,
     several,
 )
@@ -32,6 +33,7 @@ __all__ = [
     "canonical",
     "file_name",
     "game",
+    "label",
     "make",
     "register",
     "several",

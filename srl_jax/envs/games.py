@@ -187,7 +187,7 @@ def adapted(
     return Game(make, check, own_size=True, frames_per_step=frame_skip)
 
 
-REGISTRY = Registry("envs", {"atari": atari, "catch": catch, "gymnasium": gymnasium})
+REGISTRY = Registry("envs", {"atari": atari, "catch": catch, "gymnasium": gymnasium}, NAMES)
 """`REGISTRY[name](**options) -> Game`; keyword-only parameters are the options of `--game=name:key=value`.
 
 A row's factory is called wherever a game's name is read, so it should import nothing heavy.
@@ -278,6 +278,16 @@ def several(parts: Iterable[str], flag: str = "games") -> list[str]:
         else:
             whole.append(part)
     return list(dict.fromkeys(canonical(text, flag) for text in whole))
+
+
+def label(text: str) -> str:
+    """A game's name for titles: `canonical` less the options that have their defaults."""
+    name = canonical(text)
+    if name in NAMES:
+        return name
+    spec = parse(name)
+    defaults = specs.option_defaults(REGISTRY[spec.name])
+    return specs.join(spec.name, {key: x for key, x in spec.options.items() if x != defaults[key]})
 
 
 def file_name(text: str) -> str:
