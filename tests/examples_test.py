@@ -35,13 +35,7 @@ def test_its_state_is_what_is_seen(monkeypatch):
         assert (frame > 0).sum() == len({dot, place})
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        ",grey=true",
-        pytest.param("", marks=pytest.mark.skip(reason="replay and encoders take frames without channels")),
-    ],
-)
+@pytest.mark.parametrize("options", ["", ",grey=true"])
 def test_an_environment_of_ones_own_is_trained(options, tmp_path, monkeypatch):
     monkeypatch.setattr(heldout, "WINDOWS", 64)
     small = {"steps": 240, "eval_every": 120, "log_every": 40, "eval_games": 2, "eval_max_steps": 100}

@@ -79,7 +79,7 @@ def _decode(image: Callable) -> Callable:
 
 def _newest(image: Array, channels: int) -> Array:
     """The newest two frames of an image, or the one where S is 1: [B, H, W, S * C] -> [B, 2, H, W, C]."""
-    frames = image.reshape(*image.shape[:3], -1, channels)[..., -2:, :]
+    frames = image.reshape(*image.shape[:3], image.shape[3] // channels, channels)[..., -2:, :]
     return jnp.moveaxis(frames, -2, 1)
 
 

@@ -158,8 +158,8 @@ class Adapter(FrameVectorEnv):
         colours = image.shape[2] if image.ndim == 3 else 1
         if image.dtype != np.uint8 or image.ndim not in (2, 3) or colours != self._colours:
             raise ConfigError(
-                f"shows {image.dtype} {list(image.shape)}, but an image of uint8 with {self._colours} "
-                "channels was announced"
+                f"the environment shows {image.dtype} {list(image.shape)}, but an image of uint8 with "
+                f"{self._colours} channels was announced"
             )
         image = image.reshape(*image.shape[:2], colours)
         if self._grey and colours == 3:
@@ -176,8 +176,8 @@ class Adapter(FrameVectorEnv):
             state = np.asarray(info.get("state", ()), np.float32)
             if state.shape != self._states[i].shape:
                 raise ConfigError(
-                    f"its info['state'] must hold the {len(self.state_names)} numbers of its state_names, "
-                    f"got {list(state.shape)}"
+                    f"the environment's info['state'] must hold the {len(self.state_names)} numbers of its "
+                    f"state_names, got {list(state.shape)}"
                 )
             self._states[i] = state
 
