@@ -42,7 +42,7 @@ class FigureArm(NamedTuple):
 
     def preset_for(self, game: str) -> str:
         """The preset of its runs on a game: Catch is played by small networks."""
-        return self.preset or f"{envs.game(game).presets}/{self.name}"
+        return self.preset or f"{envs.known(game).presets}/{self.name}"
 
     def thesis_curve(self, game: str) -> tuple | None:
         """env steps and returns of the thesis' curve, or None."""

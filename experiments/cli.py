@@ -1,6 +1,7 @@
 """The commands of `srl-jax`, which is `python -m srl_jax`: a row of `COMMANDS` each. Imports no jax."""
 
 import importlib
+import os
 import sys
 from typing import NamedTuple
 
@@ -52,4 +53,6 @@ def main() -> None:
     if name not in COMMANDS:
         config_flags.fail(f"{name}: no such command; {specs.choices_text(name, COMMANDS)}")
     sys.argv[:] = [f"srl-jax {name}", *rest]
+    if (here := os.getcwd()) not in sys.path:  # as `python -m` has it: --game=module:Name-v0 may lie here
+        sys.path.append(here)
     importlib.import_module(f".{COMMANDS[name].module or name}", __package__).cli()

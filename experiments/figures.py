@@ -266,7 +266,10 @@ def run(values: flags.FlagValues) -> int:
     out = values["out"].value
     root = config_flags.check_place("out", out)
     options = sweep.launcher_options(values)
-    seeds, games = parse_seeds(values["seeds"].value), envs.several(values["games"].value)
+    seeds, games = (
+        parse_seeds(values["seeds"].value),
+        envs.several(values["games"].value, others=bool(values["import"].value)),
+    )
     runs = planned(figures, games, seeds, sweep.given_flags(values))
     sweep.say_what_is_replaced(values, runs)
     methods = _known(values["published"].value)

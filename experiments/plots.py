@@ -25,7 +25,7 @@ NEAR = 0.02
 
 def steps_label(game: str) -> str:
     """Of an axis of env steps, which may have several frames of an emulator in one; "" is no game."""
-    frames = envs.game(game).frames_per_step if game else 1
+    frames = envs.known(game).frames_per_step if game else 1
     return f"{STEPS_LABEL} ({frames} frames each)" if frames > 1 else STEPS_LABEL
 
 

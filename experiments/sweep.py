@@ -290,7 +290,9 @@ def chosen_runs(values: flags.FlagValues, root: Path) -> list[Planned]:
         arms = [plan.arm_of(preset) for preset in plan.presets(values["presets"].value)]
         arms = plan.grid(arms, values["grid"].value or [], given)
         seeds = plan.parse_seeds(values["seeds"].value)
-        return plan.plan(arms, envs.several(values["games"].value or []), seeds, given)
+        return plan.plan(
+            arms, envs.several(values["games"].value or [], others=bool(values["import"].value)), seeds, given
+        )
     entries = manifest.read(root)
     if not entries:
         raise ConfigError("--presets: missing; name some, as in --presets=thesis/joint_256,thesis/rl_only_*")

@@ -244,12 +244,8 @@ class Config:
         self._check_together()
 
     def _check_together(self) -> None:
-        try:
-            game = envs.game(self.game)
-        except specs.SpecError:
-            if not self.imports:  # else it may be a row of what is imported later, see `resolve`
-                raise
-            game = envs.Game(make=lambda: None, own_size=True)
+        # A row of what is imported later is known by then, see `resolve`.
+        game = envs.known(self.game) if self.imports else envs.game(self.game)
         if not (self.frame_size or game.own_size):
             raise ConfigError(f"--frame_size=0: --game={self.game} has no size of its own; give one, say 84")
         sizes = game.frame_sizes

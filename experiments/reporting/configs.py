@@ -161,7 +161,7 @@ def protocol_text(config: Config) -> str:
     """How a policy was evaluated, in a line; what a game does not have is not said of it."""
     sticky = f"sticky actions {config.sticky_actions:g}" if config.sticky_actions else "no sticky actions"
     noops = f"fewer than {config.noop_max} no-ops at the start" if config.noop_max > 1 else "no no-ops"
-    game = envs.game(config.game)
+    game = envs.known(config.game)
     frames = f", of {game.frames_per_step} frames each" if game.frames_per_step > 1 else ""
     parts = [
         f"{config.eval_games} full games an evaluation, every {config.eval_every:,} env steps",

@@ -9,6 +9,7 @@ import tempfile
 from collections import Counter
 from pathlib import Path
 
+from srl_jax import envs
 from srl_jax.config import Config
 
 from .. import control_groups, runtime
@@ -21,8 +22,12 @@ SHARE = 0.9
 
 
 def run_bytes(config: Config) -> int:
-    """About how much memory a run takes once its buffer is full: a byte a pixel, and the rest."""
-    return RUN_BYTES + config.buffer_size * config.frame_size**2
+    """About how much memory a run takes once its buffer is full: a byte a pixel and channel, and the rest.
+
+    How large and how colourful frames are only the environment knows, of a game that can be either.
+    """
+    channels = 3 if envs.known(config.game).own_size else 1
+    return RUN_BYTES + config.buffer_size * channels * (config.frame_size or 84) ** 2
 
 
 def free_bytes(root: Path = control_groups.ROOT) -> int | None:

@@ -140,7 +140,8 @@ def plan(
                 f"arm {arm.name}: there twice, of {by_name[arm.name].preset} and of {arm.preset}; "
                 "give one of them another name"
             )
-    games = [envs.canonical(game, "games") for game in games]
+    if "import" not in flags:  # else it may be a row of what is imported, which the runs will know
+        games = [envs.canonical(game, "games") for game in games]
     directories = {envs.file_name(game): game for game in reversed(games)}
     for game in games:
         if (other := directories[envs.file_name(game)]) != game:

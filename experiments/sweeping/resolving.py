@@ -27,8 +27,11 @@ INSTALLED = Path(srl_jax.__file__).resolve().parents[1]
 
 
 def environment() -> dict[str, str]:
-    """Of a process that works in another directory, from which it shall import nothing."""
-    paths = [str(INSTALLED), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))]
+    """Of a process that works in another directory, from which it shall import nothing.
+
+    Modules that lie where this process works, as of `--game=module:Name-v0`, it may import.
+    """
+    paths = [str(INSTALLED), *filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep)), os.getcwd()]
     return {**os.environ, "PYTHONPATH": os.pathsep.join(dict.fromkeys(paths)), "PYTHONSAFEPATH": "1"}
 
 

@@ -85,7 +85,7 @@ def progress(run: Path, tail: int = TAIL) -> Progress:
 
 def keys(config: Config) -> tuple[tuple, tuple]:
     """What makes runs about as fast as each other: strictly, and where there is nothing better."""
-    loose = envs.game(config.game).kind, config.encoder, config.mode
+    loose = envs.known(config.game).kind, config.encoder, config.mode
     return (*loose, config.batch_size, config.updates_per_step, config.srl_every, config.frame_size), loose
 
 

@@ -10,7 +10,6 @@ import numpy as np
 
 from srl_jax import envs
 from srl_jax.config import Config
-from srl_jax.errors import ConfigError
 
 
 class Published(NamedTuple):
@@ -187,7 +186,7 @@ def reference_scores(game: str) -> tuple[float, float]:
     Raises:
         ValueError: the game is none of them.
     """
-    if scores := _reference_scores().get(game) or _declared_scores(game):
+    if scores := _reference_scores().get(game) or envs.known(game).scores:
         return scores
     known = ", ".join(_reference_scores())
     raise ValueError(f"no reference scores for game {game}; there are some for {known}")
@@ -195,14 +194,7 @@ def reference_scores(game: str) -> tuple[float, float]:
 
 def with_reference_scores(games: Iterable[str]) -> list[str]:
     """Those of the games that `reference_scores` knows."""
-    return [game for game in games if game in _reference_scores() or _declared_scores(game)]
-
-
-def _declared_scores(game: str) -> tuple[float, float] | None:
-    try:
-        return envs.game(game).scores
-    except ConfigError:
-        return None
+    return [game for game in games if game in _reference_scores() or envs.known(game).scores]
 
 
 def published(game: str) -> list[Published]:

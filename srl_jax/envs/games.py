@@ -249,6 +249,14 @@ def game(text: str, flag: str = "game") -> Game:
     return dataclasses.replace(row, kind=row.kind or spec.name)
 
 
+def known(text: str) -> Game:
+    """What is known here of a game: nothing, if its row is of a plug-in that this process does not import."""
+    try:
+        return game(text)
+    except specs.SpecError:
+        return Game(make=game, own_size=True)  # to make it raises the error
+
+
 def canonical(text: str, flag: str = "game") -> str:
     """The one way to write a game's name that config.json has: with every option, or the game's own name.
 
@@ -265,8 +273,13 @@ def _own_names() -> dict[str, str]:
     return {specs.parse(text, REGISTRY).full: name for name, text in NAMES.items()}
 
 
-def several(parts: Iterable[str], flag: str = "games") -> list[str]:
+def several(parts: Iterable[str], flag: str = "games", *, others: bool = False) -> list[str]:
     """The names, as of `canonical`, of a list that was cut at every comma, those between options included.
+
+    Args:
+        parts: of the list.
+        flag: names the flag in errors, without dashes.
+        others: there may be games of plug-ins, whose names stay as they are.
 
     Raises:
         SpecError: see `game`.
@@ -277,12 +290,15 @@ def several(parts: Iterable[str], flag: str = "games") -> list[str]:
             whole[-1] += f",{part}"
         else:
             whole.append(part)
-    return list(dict.fromkeys(canonical(text, flag) for text in whole))
+    return list(dict.fromkeys(text if others else canonical(text, flag) for text in whole))
 
 
 def label(text: str) -> str:
     """A game's name for titles: `canonical` less the options that have their defaults."""
-    name = canonical(text)
+    try:
+        name = canonical(text)
+    except specs.SpecError:
+        return text
     if name in NAMES:
         return name
     spec = parse(name)
