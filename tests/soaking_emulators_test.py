@@ -107,7 +107,7 @@ def test_a_record_notices_one_wrong_number(field):
     for row in range(len(indices)):
         array = getattr(window, field).copy()
         # Not of a frame's name: its other pixels count, too.
-        at = (rng.integers(array.shape[1]), *([SIZE - 1] * (array.ndim - 2)))
+        at = (rng.integers(array.shape[1]), *(side - 1 for side in array.shape[2:]))
         array[(row, *at)] += 1
         right = record.right_windows(window._replace(**{field: array}), indices, STACK, GAMMA)
         assert np.flatnonzero(~right).tolist() == [row]
