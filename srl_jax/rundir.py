@@ -1,4 +1,4 @@
-"""A run directory has one writer at a time."""
+"""Locks of run directories: each directory has one writer at a time."""
 
 import contextlib
 import fcntl
