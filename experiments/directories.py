@@ -1,4 +1,4 @@
-"""Run directories: new ones, ones to overwrite, to go on from, to be read; one writer at a time."""
+"""Run directories: new ones, and ones to overwrite, to resume or to read; each has one writer at a time."""
 
 import contextlib
 import os
@@ -18,7 +18,7 @@ from . import flags as config_flags
 
 
 def say(line: str) -> None:
-    """A line about going on, for whoever watches."""
+    """A line about resuming, for whoever watches."""
     display.say(f"resume: {line}")
 
 
@@ -36,7 +36,7 @@ def runs_below(root: Path) -> list[Path]:
     """
 
     def refuse(error: OSError) -> None:
-        if not isinstance(error, FileNotFoundError):  # removed meanwhile, by a run that goes on
+        if not isinstance(error, FileNotFoundError):  # removed meanwhile, by a run that is under way
             raise ConfigError(f"{error.filename}: {error.strerror}")
 
     found: list[str] = []
@@ -76,7 +76,7 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
         out: the path, or None where it was not given.
         config: what it starts from must not be deleted.
         overwrite: a run that lies there may be deleted.
-        resume: a run that lies there will be gone on with.
+        resume: whether a run that lies there will be resumed.
 
     Returns:
         The path.
@@ -87,18 +87,18 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
     if not out:
         raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
     if overwrite and resume:
-        raise ConfigError("--resume=auto: goes on with the run that --overwrite deletes; give one of them")
+        raise ConfigError("--resume=auto: resumes the run that --overwrite deletes; give one of them")
     path = config_flags.check_place("out", out)
     try:
         if blank(path):
             return path
         if resume:
             if not _is_run(path):
-                raise ConfigError(f"--out={out}: not a run directory, so --resume=auto cannot go on from it")
+                raise ConfigError(f"--out={out}: not a run directory, so --resume=auto cannot resume it")
             return path
         if not overwrite:
             raise ConfigError(
-                f"--out={out}: not empty; name a new directory, or --resume=auto goes on with the run, "
+                f"--out={out}: not empty; name a new directory, or --resume=auto resumes the run, "
                 "or --overwrite deletes it"
             )
         if path.is_symlink():
@@ -210,7 +210,7 @@ def run_directory(path: Path, config: Config) -> Iterator[None]:
 
 
 def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifest | None:
-    """The checkpoint from which the run in a directory can go on; writes nothing.
+    """The checkpoint from which the run in a directory can be resumed; writes nothing.
 
     Args:
         path: of a run directory, or of one that is still to be made.
@@ -232,15 +232,15 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
     there = Config.load(path)
     if differing := another_run(there, config):
         raise ConfigError(
-            f"--out={path}: the run there has another configuration: {differing}; go on with its own, name "
-            "another directory, or --overwrite without --resume starts anew"
+            f"--out={path}: the run there has another configuration: {differing}; resume it with its own, "
+            "name another directory, or --overwrite without --resume starts anew"
         )
     manifest = checkpoint.newest_good(path, say, at_most)
     if manifest is None:
         if (steps := reached(path)) >= first_checkpoint(config):
             raise ConfigError(
-                f"--out={path}: the run there got to {steps} env steps, and there is no checkpoint that it "
-                "could go on from; --overwrite would start anew"
+                f"--out={path}: the run there got to {steps} env steps, and there is no checkpoint to "
+                "resume it from; --overwrite would start anew"
             )
         say_anew(path)
         return None
@@ -250,7 +250,7 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
         if config.steps > there.steps:
             raise ConfigError(
                 f"--steps={config.steps}: the run in {path} has ended after {manifest.env_steps} env steps "
-                "and left no replay to go on with; --keep_replay beside training keeps it"
+                "and left no replay to resume with; --keep_replay beside training keeps it"
             )
         return manifest
     if config.steps < manifest.env_steps:
@@ -265,7 +265,7 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
     for flag in SOURCES:
         then, now = getattr(there, flag), getattr(config, flag)
         if then != now:
-            how = "the run goes on with the latter" if flag == "policy_from" else "neither is read any more"
+            how = "the run resumes with the latter" if flag == "policy_from" else "neither is read any more"
             say(f"{path}: --{flag} was {then} and is {now}: {how}")
     if changed := changes(path):
         what = ", ".join(
@@ -287,7 +287,7 @@ def _by_the_end(config: Config) -> str:
 
 @contextlib.contextmanager
 def going_on(path: Path, manifest: Manifest, config: Config) -> Iterator[None]:
-    """Holds the directory of a run that goes on; its config.json gets what has changed since it began.
+    """Holds the directory of a run that is resumed; its config.json gets what has changed since it began.
 
     Raises:
         ConfigError: another process writes there.
@@ -302,10 +302,10 @@ def going_on(path: Path, manifest: Manifest, config: Config) -> Iterator[None]:
 
 
 def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
-    """`to_resume` of runs that go on in step: checkpoints of the same env step, or None for all.
+    """`to_resume` of runs that are resumed in step: checkpoints of the same env step, or None for all.
 
     Raises:
-        ConfigError: one cannot go on, or it would have to begin again and another one got further.
+        ConfigError: one cannot be resumed, or it would have to begin again and another one got further.
     """
     at_most = None
     while True:
@@ -316,7 +316,7 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
                 never = not (first / "config.json").exists()
                 if manifest and (never or manifest.env_steps >= first_checkpoint(config)):
                     raise ConfigError(
-                        f"--out={first}: no checkpoint there to go on from, while {path} has one of "
+                        f"--out={first}: no checkpoint there to resume from, while {path} has one of "
                         f"{manifest.env_steps} env steps; --overwrite would start all of them anew"
                     )
             return [None] * len(runs)

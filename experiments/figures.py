@@ -3,7 +3,7 @@
     python -m experiments.figures --figure=6.3 --games=Pong,Breakout --seeds=3 --steps=500000
 
 Every arm of the figure that has not been run yet is run, each seed as a process of its own that can be killed
-and gone on with; then the figure is drawn: mean evaluation return over seeds with 95 % t intervals at each
+and resumed; then the figure is drawn: mean evaluation return over seeds with 95 % t intervals at each
 point, against env steps, over the thesis' own curve where there is one, with lines for what a random and a
 no-op policy score. FIGURE.png and FIGURE.json (its numbers) go to OUT/figures. Runs lie in OUT/GAME/ARM/seedN
 and are shared by all figures.

@@ -31,7 +31,7 @@ def command_line(run: str) -> list[str]:
     if (path / "config.json").is_file():
         return [f"--config={path / 'config.json'}", *goes_on]
     if (path / FILE).is_file():
-        raise ConfigError(f"{run}: a sweep, with which srl-jax sweep --out={run} goes on")
+        raise ConfigError(f"{run}: a sweep, which srl-jax sweep --out={run} resumes")
     seeds = sorted((folder.parent.name for folder in path.glob("seed*/config.json")), key=natural)
     if not seeds:
         raise ConfigError(f"{run}: not a run directory (no config.json)")

@@ -2,7 +2,7 @@
 
 A run for each preset, game and seed, and the runs whose encoder or policy these start from, each a process
 with a run directory of its own, --out/GAME/ARM/seedN. Given again, the command runs what is missing or
-broken; with --out alone it goes on with everything that was ever planned there. Ctrl-C, SIGTERM, SIGHUP and
+broken; with --out alone it resumes everything that was ever planned there. Ctrl-C, SIGTERM, SIGHUP and
 SIGUSR1 write a checkpoint of each run and end. `--status` says how far a sweep is, `--dry_run` what one would
 do. `--grid=lr_rl=1e-4,3e-4 --grid=batch_size=32,64` tries each combination; a table of the arms, the best one
 first, comes at the end.
@@ -38,7 +38,7 @@ LAUNCHERS = ("local", "ray")
 
 _INFOS = {
     "workers": Info(int, "runs at once; 0: one a core, as far as memory allows, and one on a GPU", minimum=0),
-    "retries": Info(int, "how often a run that crashed is gone on with", minimum=0),
+    "retries": Info(int, "how often a run that crashed is resumed", minimum=0),
     "cpus_per_run": Info(int, "cores that a run keeps to", "cores", minimum=1),
     "gpus_per_run": Info(float, "of one GPU or several, with --launcher=ray", "GPUs", minimum=0),
 }
@@ -165,7 +165,7 @@ def run_sweep(
         runs: from `plan.plan`.
         launcher: one of `LAUNCHERS`.
         workers: runs at once; None: as many as there is room for.
-        retries: how often a run that crashed is gone on with: no bad setting, full disk or infinite loss.
+        retries: how often a run that crashed is resumed: no bad setting, full disk or infinite loss.
         cpus_per_run: cores that a run keeps to. Roundings, and so results, may depend on it.
         gpus_per_run: of one GPU or several, for Ray.
         ray_address: of a Ray cluster; None starts one on this machine.
@@ -298,7 +298,7 @@ def chosen_runs(values: flags.FlagValues, root: Path) -> list[Planned]:
         raise ConfigError("--presets: missing; name some, as in --presets=thesis/joint_256,thesis/rl_only_*")
     if flag := next((name for name in ("games", "seeds", "grid", *given) if values[name].present), None):
         raise ConfigError(
-            f"--{flag}: only with --presets; without it, the sweep in --out goes on as it was planned"
+            f"--{flag}: only with --presets; without it, the sweep in --out is resumed as it was planned"
         )
     return [entry.run for entry in entries.values()]
 

@@ -221,7 +221,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         )
         draw([directory for directory, _ in runs], [config for _, config in runs], results)
     if any(result.interrupted for result in results):
-        print(f"stopped after {results[0].env_steps} env steps; --resume=auto goes on from there, in {path}")
+        print(f"stopped after {results[0].env_steps} env steps; --resume=auto resumes from there, in {path}")
         return 128 + (caught[0] if caught else signal.SIGINT)
     done = f"{results[0].env_steps} env steps, {results[0].updates} updates"
     print(f"{done}{' of each seed' if seeds else ''}; everything is in {path}")

@@ -96,7 +96,7 @@ class Report:
 
     @property
     def seconds(self) -> float:
-        """Since the run began, without those between being killed and going on."""
+        """Since the run began, without those between being killed and being resumed."""
         return time.perf_counter() - self._started
 
     def ended(self, returns: np.ndarray) -> None:

@@ -395,7 +395,7 @@ def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
     assert (out / "metrics.jsonl").read_text() == "kept" and made == checkpoint.read_manifest(out)
     assert not (out / "lock").exists()
     # Without the flag, nothing is touched, as before.
-    assert "--resume=auto goes on with the run" in _refused(capsys, *CATCH[1:], f"--out={out}")
+    assert "--resume=auto resumes the run" in _refused(capsys, *CATCH[1:], f"--out={out}")
 
 
 def test_a_start_that_failed_is_in_nobodys_way(capsys, loop, tmp_path, monkeypatch):
@@ -422,7 +422,7 @@ def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     _checkpoint(out, 200)
     before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*"))
     resume = [*CATCH[1:], f"--out={out}", "--resume=auto"]
-    assert "--resume=auto: goes on with the run that --overwrite deletes" in _refused(
+    assert "--resume=auto: resumes the run that --overwrite deletes" in _refused(
         capsys, *resume, "--overwrite"
     )
     line = _refused(capsys, *resume, "--seed=7", "--gamma=0.5")
@@ -434,7 +434,7 @@ def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     foreign.mkdir()
     (foreign / "notes.txt").write_text("mine")
     line = _refused(capsys, *CATCH[1:], f"--out={foreign}", "--resume=auto")
-    assert "not a run directory, so --resume=auto cannot go on from it" in line
+    assert "not a run directory, so --resume=auto cannot resume it" in line
     assert [p.name for p in foreign.iterdir()] == ["notes.txt"]
     assert len(loop.calls) == 1
 
@@ -473,7 +473,7 @@ def test_pretraining_goes_on_with_the_policy_that_it_needs(capsys, loop, tmp_pat
     line = _refused(capsys, *pretrain[1:], f"--policy_from={policy}")
     assert line == (f"error: --policy_from={policy}: no such path; give a run directory or a checkpoint\n")
     assert _train(*pretrain, f"--policy_from={tmp_path}/moved") == 0 and loop.resumed[-1] == made
-    assert "the run goes on with the latter" in capsys.readouterr().err
+    assert "the run resumes with the latter" in capsys.readouterr().err
 
 
 def test_two_processes_do_not_write_one_run(capsys, loop, tmp_path):
@@ -527,7 +527,7 @@ def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkey
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     assert _train(*CATCH, f"--out={tmp_path}/run") == 128 + number
     assert capsys.readouterr().out.endswith(
-        f"stopped after 40 env steps; --resume=auto goes on from there, in {tmp_path}/run\n"
+        f"stopped after 40 env steps; --resume=auto resumes from there, in {tmp_path}/run\n"
     )
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
@@ -599,7 +599,7 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
     assert first.returncode == 128 + signal.SIGTERM
     stopped = checkpoint.read_manifest(out).env_steps
     assert 80 <= stopped < 1200
-    line = f"stopped after {stopped} env steps; --resume=auto goes on from there, in {out}"
+    line = f"stopped after {stopped} env steps; --resume=auto resumes from there, in {out}"
     assert line in printed.splitlines()
 
     done = _python("-m", "srl_jax", "resume", str(out), "--tune_runtime=off")

@@ -241,7 +241,7 @@ def test_seeds_go_on_from_the_newest_step_that_all_have(tmp_path, checkpoints, e
 def test_no_seed_begins_again_for_the_sake_of_another(tmp_path, checkpoints):
     runs = seeds(tmp_path, *checkpoints)
     with pytest.raises(
-        ConfigError, match="seed1: no checkpoint there to go on from, while .*seed0 has one of"
+        ConfigError, match="seed1: no checkpoint there to resume from, while .*seed0 has one of"
     ):
         all_to_resume(runs)
     with pytest.raises(ConfigError, match="seed1: no checkpoint there"):
@@ -335,7 +335,7 @@ def test_what_a_run_has_written_is_kept(tmp_path, kind):
     with pytest.raises(ConfigError, match="not empty; name a new directory"):
         check_out(str(path), CONFIG, overwrite=False, resume=False)
     if kind != "a checkpoint":
-        with pytest.raises(ConfigError, match="another configuration: gamma .*; go on with its own"):
+        with pytest.raises(ConfigError, match="another configuration: gamma .*; resume it with its own"):
             to_resume(path, dataclasses.replace(CONFIG, gamma=0.5))
 
 

@@ -94,7 +94,7 @@ def test_crashes_are_gone_on_with_and_errors_are_not(stubs, capsys):
     assert sorted(outcome.done) == [A, C] and outcome.status == 1
     assert outcome.failed == {B: "ended on purpose 1"}
     assert [stubs.count(name) for name in (A, B, C)] == [3, 1, 1]
-    assert f"{A}: killed by SIGKILL; going on with it" in capsys.readouterr().err
+    assert f"{A}: killed by SIGKILL; resuming it" in capsys.readouterr().err
     assert (stubs.record(A).attempts, stubs.record(B).status) == (3, 2)
 
 

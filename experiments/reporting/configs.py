@@ -17,13 +17,13 @@ SPECIFICATIONS = ("rl", "encoder", "objectives")
 """Fields that are name:key=value,..., shown option by option."""
 
 THEN = ", then "
-"""Between what a run was made by and what it went on under."""
+"""Between what a run was made by and what it was resumed under."""
 
 
 class About(NamedTuple):
     """What config.json says of where a run was made; empty where it does not.
 
-    Of a run that went on under other versions or elsewhere, each is there in turn: `1.2, then 1.3`.
+    Of a run that was resumed under other versions or elsewhere, each is there in turn: `1.2, then 1.3`.
     """
 
     revision: str

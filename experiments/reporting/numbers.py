@@ -34,7 +34,7 @@ class Comparison(NamedTuple):
     Attributes:
         steps: int64 [points].
         returns: arm -> float64 [runs, points].
-        cut_by: the run that ends first, where others go on.
+        cut_by: the run that ends first, where others continue.
     """
 
     steps: np.ndarray

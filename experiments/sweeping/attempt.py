@@ -96,5 +96,5 @@ class Attempt:
 
 
 def retryable(status: int) -> bool:
-    """Whether a run that ended so may end otherwise when it is gone on with."""
+    """Whether a run that ended so may end otherwise when it is resumed."""
     return status not in (0, BAD_INPUT, NO_SPACE, DIVERGED)

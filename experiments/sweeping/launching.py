@@ -43,7 +43,7 @@ class Launcher(Protocol):
         """Whether one more run can be started now."""
 
     def start(self, entry: Entry) -> None:
-        """Starts a run, or goes on with it.
+        """Starts a run, or resumes it.
 
         Raises:
             SaveError: nothing can be written.
@@ -126,7 +126,7 @@ def launch(
         entries: {name: Entry}, each after those that it starts from, which are all among them.
         launcher: executes them.
         screen: shows them.
-        retries: how often a run that crashed is gone on with.
+        retries: how often a run that crashed is resumed.
         every_s: how often to look, in seconds.
 
     Raises:
@@ -208,7 +208,7 @@ class _Sweep:
                 self.disk = f"{name}: {reason}"
                 self.stop(f"stopping: {self.disk}")
             elif again and attempt.retryable(status) and self.attempts[name] <= self.retries:
-                self.screen.note(f"{name}: {reason}; going on with it")
+                self.screen.note(f"{name}: {reason}; resuming it")
                 self.waiting = {name: reason, **self.waiting}
             else:
                 self.failed[name] = reason

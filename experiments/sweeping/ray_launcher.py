@@ -2,10 +2,10 @@
 
 A task gets texts and returns a small dict; everything else goes by way of the sweep's directory, which every
 node sees under the same path, as it does the checkout and the interpreter. Of Ray it takes tasks, resources
-and retries: when a worker or its node is lost, Ray starts the task again elsewhere, and the run goes on from
-its own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a task
-that is started again waits until the run's former process has ended. A file system that nodes share has to
-have such locks, as NFS 4 does; there, those of a node that is lost go when its lease ends.
+and retries: when a worker or its node is lost, Ray starts the task again elsewhere, and the run is resumed
+from its own checkpoint. The lock of a run directory is an flock: it goes with the process that has it, so a
+task that is started again waits until the run's former process has ended. A file system that nodes share has
+to have such locks, as NFS 4 does; there, those of a node that is lost go when its lease ends.
 """
 
 import importlib.util
@@ -44,7 +44,7 @@ class Ray:
         workers: runs at once; None: as many as the cluster has room for.
         cpus_per_run: cores that a run is given, and keeps to.
         gpus_per_run: GPUs that a run is given; less than 1 shares one.
-        retries: how often a run is gone on with whose worker or node was lost.
+        retries: how often a run is resumed whose worker or node was lost.
         address: of a cluster, HOST:PORT or auto; None starts one on this machine.
         command: the command line of a run.
 
@@ -182,7 +182,7 @@ def _task() -> Callable[..., dict]:
 def run_here(
     root: str, name: str, command: list[str], config: str, stop_file: str, cpus: int, gpus: float
 ) -> dict:
-    """Runs or goes on with a run in this process' own child, and waits for it.
+    """Runs or resumes a run in this process' own child, and waits for it.
 
     Args:
         root: of the sweep.

@@ -129,7 +129,7 @@ def _incomplete(path: Path, found: checkpoint.Manifest) -> str | None:
 
 
 def prepare(path: Path, config: Config, say: Callable[[str], None]) -> State:
-    """`look`, then everything that going on needs is read and compared; what is broken is moved aside.
+    """`look`, then everything that resuming needs is read and compared; what is broken is moved aside.
 
     Args:
         path, config: see `look`.
@@ -161,7 +161,7 @@ def prepare(path: Path, config: Config, say: Callable[[str], None]) -> State:
 
 
 def _broken(path: Path, config: Config) -> str:
-    """Why a run cannot be gone on with from any of its checkpoints, or ""."""
+    """Why a run cannot be resumed from any of its checkpoints, or ""."""
     try:
         found = checkpoint.newest_good(path, lambda line: None)
         if found is None:
