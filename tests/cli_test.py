@@ -567,7 +567,7 @@ def test_resume_refuses_what_is_no_run(tmp_path):
     with pytest.raises(ConfigError, match="not a run directory"):
         resume.command_line(str(tmp_path))
     (tmp_path / "sweep.json").touch()
-    with pytest.raises(ConfigError, match="a sweep, with which srl-jax sweep --out="):
+    with pytest.raises(ConfigError, match="a sweep, which srl-jax sweep --out="):
         resume.command_line(str(tmp_path))
     done = _python("-m", "experiments.resume")
     assert (done.returncode, done.stderr) == (

@@ -129,6 +129,14 @@ def test_every_row_is_named(rows):
         assert re.search(rf"(?<![\w/]){name}(?!\w)", text), name
 
 
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_code_is_python_and_json(page):
+    for code in _blocks(page, "python"):
+        compile(code, page.name, "exec")
+    for text in _blocks(page, "json"):
+        json.loads(text)
+
+
 @pytest.fixture
 def registry(monkeypatch):
     """A registry of objectives that is empty, and that nobody else sees."""
