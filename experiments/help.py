@@ -21,8 +21,8 @@ GROUPS: dict[str, str] = {
     "Optimisation": "lr_rl lr_srl lr_encoder lr_encoder_srl lr_final_share decoder_weight_decay "
     "max_grad_norm adam_eps",
     "Evaluation": "eval_every eval_games eval_max_steps eps_eval stop_at_return diagnostics diagnostics_kept",
-    "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every tensorboard print_config "
-    "tune_runtime",
+    "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every keep_best keep_replay "
+    "tensorboard print_config tune_runtime",
 }
 """Flags of training, in the order in which they are shown; others are a program's own."""
 

@@ -266,7 +266,12 @@ def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypa
 
     monkeypatch.setattr(actor, "make_env", make_env)
     given = {"run": str(joint[0]), "games": 1, "seed": 0, "epsilon": None, "gif": "", "tune_runtime": "off"}
-    monkeypatch.setattr(evaluate, "FLAGS", SimpleNamespace(**given))
+
+    class Flags(SimpleNamespace):
+        def __getitem__(self, name):
+            return SimpleNamespace(value=None)
+
+    monkeypatch.setattr(evaluate, "FLAGS", Flags(**given))
     evaluate.main([])
     assert asked == [(("eval", 1), {"seed": 0})]
     assert len(json.loads(capsys.readouterr().out)["returns"]) == 1
@@ -464,7 +469,7 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
     np.testing.assert_array_equal(result.recording[..., 0], 255 - result.recording[..., 2])
     for name in ("reconstruction", "forward_pixels"):
         inputs, targets, outputs = result.pictures[name]
-        assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 50, 3)
+        assert inputs.shape == targets.shape == outputs.shape == (6, 42, 50, 3)
         np.testing.assert_allclose(targets[..., 0], 1 - targets[..., 2], atol=1e-6)
         assert rows[0][-1][f"diag/error/{name}/moving"] > 0
     # No environment is needed to know it.
