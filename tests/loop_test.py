@@ -473,12 +473,12 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
         np.testing.assert_allclose(targets[..., 0], 1 - targets[..., 2], atol=1e-6)
         assert rows[0][-1][f"diag/error/{name}/moving"] > 0
     # No environment is needed to know it.
-    loaded, _, manifest = loop.load_agent(path)
+    loaded, _, manifest = loading.load_agent(path)
     assert manifest.frame_shape == (42, 50, 3) and loaded.encoder.observation_shape == (42, 50, 12)
     for flag in ("policy_from", "encoder_from"):
         grey = Config(**{**SMALL, "mode": "pretrain", "objectives": ("latent_l2",), flag: str(path)})
         with pytest.raises(ConfigError, match=rf"--{flag}=.* of \[42, 50, 3\], Catch shows \[42, 42, 1\]"):
-            loop.Run(grey, tmp_path, progress=False)
+            one_run(grey, tmp_path)
 
 
 def test_early_stop(tmp_path):
