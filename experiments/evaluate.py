@@ -96,17 +96,24 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     display.result(json.dumps(result))
 
 
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines this entry point's flags."""
+    flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", flag_values=values)
+    games = Info(int, "full games to play", minimum=1, maximum=1_000_000)
+    config_flags.define("games", games, 10, values)
+    seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
+    config_flags.define("seed", seed, 0, values)
+    epsilon = "probability of a random action; the run's eps_eval if not given"
+    config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None, values)
+    config_flags.define_import_flag(values)
+    gif = "file to write the first game to, as a GIF"
+    flags.DEFINE_string("gif", "", gif, flag_values=values)
+    config_flags.define_runtime_flag(values)
+
+
 def cli() -> None:
     """Runs this entry point as a program."""
-    flags.DEFINE_string("run", "", "run directory, or one of its checkpoints")
-    config_flags.define("games", Info(int, "full games to play", minimum=1, maximum=1_000_000), 10)
-    seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
-    config_flags.define("seed", seed, 0)
-    epsilon = "probability of a random action; the run's eps_eval if not given"
-    config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None)
-    config_flags.define_import_flag()
-    flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF")
-    config_flags.define_runtime_flag()
+    define_flags()
     config_flags.run(functools.partial(main, prepare=runtime.prepare), positional="run")
 
 

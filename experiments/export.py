@@ -36,12 +36,18 @@ def main(argv: list[str]) -> None:
     print(f"{path}: {config.encoder.partition(':')[0]}, observations {shape} to {encoder.features} numbers")
 
 
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines this entry point's flags."""
+    run = "run directory, one of its checkpoints, or an encoder that was kept"
+    flags.DEFINE_string("run", "", run, flag_values=values)
+    flags.DEFINE_string("encoder", "", "file to write, which ends in .npz", flag_values=values)
+    flags.DEFINE_boolean("overwrite", False, "replace the file if there is one", flag_values=values)
+    config_flags.define_import_flag(values)
+
+
 def cli() -> None:
     """Runs this entry point as a program."""
-    flags.DEFINE_string("run", "", "run directory, one of its checkpoints, or an encoder that was kept")
-    flags.DEFINE_string("encoder", "", "file to write, which ends in .npz")
-    flags.DEFINE_boolean("overwrite", False, "replace the file if there is one")
-    config_flags.define_import_flag()
+    define_flags()
     config_flags.run(main, positional="run")
 
 

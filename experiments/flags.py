@@ -269,14 +269,14 @@ def check_place(flag: str, text: str) -> Path:
     return path
 
 
-def check_file(flag: str, text: str, suffix: str, *, overwrite: bool = False) -> Path:
+def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = None) -> Path:
     """The path of a file that is to be made, in a directory that is there; writes nothing.
 
     Args:
         flag: that it came from.
         text: its value, with or without ~.
         suffix: what it has to end in.
-        overwrite: whether a file may be there already.
+        overwrite: whether a file may be there already; None where no flag allows it.
 
     Raises:
         ConfigError: it has another name, or something lies there, or the directory does not.
@@ -288,7 +288,8 @@ def check_file(flag: str, text: str, suffix: str, *, overwrite: bool = False) ->
     try:
         there = os.path.lexists(path)
         if there and not overwrite:
-            raise ConfigError(f"--{flag}={text}: exists; name a new file")
+            hint = "" if overwrite is None else ", or --overwrite replaces it"
+            raise ConfigError(f"--{flag}={text}: exists; name a new file{hint}")
         if there and not path.is_file():
             raise ConfigError(f"--{flag}={text}: exists and is not a file")
         if not path.absolute().parent.is_dir():

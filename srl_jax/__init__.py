@@ -20,6 +20,16 @@ if TYPE_CHECKING:
     from srl_jax.replay import Replay
     from srl_jax.rl import losses
     from srl_jax.training import train
+else:  # a checker would take any name for one that is there
+
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = importlib.import_module(_MODULES[name])
+        value = module if module.__name__.endswith(f".{name}") else getattr(module, name)
+        globals()[name] = value
+        return value
+
 
 __version__ = "0.1.0"
 __all__ = ["Config", "Replay", "__version__", "encoders", "load", "losses", "objectives", "train"]
@@ -34,15 +44,6 @@ _MODULES = {
     "train": "srl_jax.training",
 }
 """Where each name is: a module of that name, or the module that has it."""
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    module = importlib.import_module(_MODULES[name])
-    value = module if module.__name__.endswith(f".{name}") else getattr(module, name)
-    globals()[name] = value
-    return value
 
 
 def __dir__() -> list[str]:

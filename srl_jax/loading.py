@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Callable, Iterable
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -95,8 +96,8 @@ class Loaded:
     def _check_policy(self) -> None:
         if RL not in self.params:
             raise ConfigError(
-                f"{self.manifest.path}: no policy was kept there, an encoder alone; name a run that trains RL "
-                "or one of its checkpoints"
+                f"{self.manifest.path}: no policy was kept there, an encoder alone; name a run that trains "
+                "RL or one of its checkpoints"
             )
 
     def _over(self, function: Callable[[Array], jax.Array], observations: Array) -> jax.Array:
@@ -131,7 +132,7 @@ def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) 
         srl_jax.errors.ConfigError: there is none, it is damaged, does not fit this code, or something cannot
             be imported; one line.
     """
-    manifest = checkpoint.read_manifest(path)
+    manifest = checkpoint.read_manifest(Path(path))
     plugins.load(map(plugins.located, manifest.config.imports if imports is None else imports))
     try:
         agent = make_agent(manifest.config, manifest.frame_shape, manifest.num_actions)

@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True) -> "Result":
     """Trains one agent and writes its run directory, as `srl-jax train` does but for the figures.
 
-    `srl-jax resume` goes on with it, `srl-jax draw` draws its figures, `srl_jax.load` loads it. Ctrl-C ends it
-    and leaves the last checkpoint. The command also sets what jax runs well with on a CPU before jax is
-    imported; here the environment is as the caller has it.
+    `srl-jax resume` goes on with it, `srl-jax draw` draws its figures, `srl_jax.load` loads it. Ctrl-C
+    ends it and leaves the last checkpoint. The command also sets what jax runs well with on a CPU before jax
+    is imported; here the environment is as the caller has it.
 
     Args:
         config: see its fields; what it leaves to defaults is written out in config.json.

@@ -8,18 +8,20 @@ import re
 import shutil
 import threading
 import time
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
+from absl import flags
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
+from experiments import flags as config_flags
 from srl_jax import actor, checkpoint, ending, loading, loop, schedules
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
+from srl_jax.diagnostics.pictures import PICTURES
 from srl_jax.envs.catch import Catch
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
@@ -263,8 +265,10 @@ def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypa
         return make(*arguments, **options)
 
     monkeypatch.setattr(actor, "make_env", make_env)
-    given = {"run": str(joint[0]), "games": 1, "seed": 0, "epsilon": None, "gif": "", "tune_runtime": "off"}
-    monkeypatch.setattr(evaluate, "FLAGS", SimpleNamespace(**given))
+    values = flags.FlagValues()
+    evaluate.define_flags(values)
+    config_flags.parse(["evaluate", f"--run={joint[0]}", "--games=1"], values)
+    monkeypatch.setattr(evaluate, "FLAGS", values)
     evaluate.main([])
     assert asked == [(("eval", 1), {"seed": 0})]
     assert len(json.loads(capsys.readouterr().out)["returns"]) == 1
@@ -462,7 +466,7 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
     np.testing.assert_array_equal(result.recording[..., 0], 255 - result.recording[..., 2])
     for name in ("reconstruction", "forward_pixels"):
         inputs, targets, outputs = result.pictures[name]
-        assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 50, 3)
+        assert inputs.shape == targets.shape == outputs.shape == (PICTURES, 42, 50, 3)
         np.testing.assert_allclose(targets[..., 0], 1 - targets[..., 2], atol=1e-6)
         assert rows[0][-1][f"diag/error/{name}/moving"] > 0
     # No environment is needed to know it.

@@ -2,8 +2,8 @@
 
 `observation_shape` is (H, W, S * C), of any size from the least that the layers fit. Each comes with the
 decoder that mirrors it, and all have the options `init`, `zero_sum`, `gain` and `decoder_scale`: see
-`srl_jax.encoders.convolutional.Start`. `flax_encoder` makes an encoder of any flax module. `from_npz` loads one
-that `srl-jax export` has written.
+`srl_jax.encoders.convolutional.Start`. `flax_encoder` makes an encoder of any flax module.
+`from_npz` loads one that `srl-jax export` has written.
 """
 
 from srl_jax.encoders.adapter import flax_encoder
@@ -18,7 +18,7 @@ __all__ = ["REGISTRY", "register", "flax_encoder", "from_npz", "impala", "nature
 
 
 def nature(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     *,
     init: str = "pytorch",
     zero_sum: bool = False,
@@ -35,7 +35,7 @@ def nature(
 
 
 def sac_ae(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     *,
     features: int = 256,
     layer_norm: bool = True,
@@ -60,7 +60,7 @@ def sac_ae(
 
 
 def tiny(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     *,
     features: int = 64,
     init: str = "pytorch",

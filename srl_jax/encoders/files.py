@@ -34,7 +34,7 @@ def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec:
         SaveError: it could not be written.
     """
     path = Path(path)
-    arrays = {name: np.asarray(x) for name, x in flatten_dict(to_state_dict(params), sep="/").items()}
+    arrays: dict[str, Any] = {name: np.asarray(x) for name, x in flatten_dict(to_state_dict(params), sep="/").items()}
     if ABOUT in arrays:
         raise ConfigError(f"{path}: the encoder {spec} has a parameter {ABOUT}, a name that the file needs")
     shape = list(encoder.observation_shape)
@@ -42,7 +42,7 @@ def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec:
     partial = path.with_name(f".{path.name}.partial")
     try:
         with open(partial, "wb") as file:
-            np.savez(file, **{ABOUT: np.array(json.dumps(text))}, **arrays)
+            np.savez(file, **arrays | {ABOUT: np.array(json.dumps(text))})
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
