@@ -17,7 +17,7 @@ N, A, ATOMS = 8, 3, jnp.linspace(-2, 2, 31)
 conv, flat = nn.Conv(16, (6, 6), 4), lambda x: x.reshape(len(x), -1)
 network = nn.Sequential([lambda x: x / 255, conv, nn.relu, flat, nn.Dense(64), nn.relu])
 encoder = encoders.flax_encoder(network, None, (42, 42, 4))
-inverse, optimizer = objectives.inverse(types.Context.of(encoder, A)), optax.adam(5e-4)
+inverse, optimizer = objectives.inverse(types.Context.of(encoder, A)), optax.adam(1e-3)
 
 
 def logits(params: types.Params, x: types.Array) -> jax.Array:
@@ -69,7 +69,7 @@ def main(steps: int = 60_000) -> list[float]:
             returns += score[over].tolist()
             stack[over], score[over] = frames[over], 0
         if len(replay) >= 100:
-            batch, indices = replay.sample(32, beta=0.4)
+            batch, indices = replay.sample(64, beta=0.4)
             params, opt_state, td_error = learn(params, slow, opt_state, batch)
             replay.set_priorities(indices, td_error)
         if step % 800 == 0:

@@ -34,7 +34,9 @@ def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec:
         SaveError: it could not be written.
     """
     path = Path(path)
-    arrays: dict[str, Any] = {name: np.asarray(x) for name, x in flatten_dict(to_state_dict(params), sep="/").items()}
+    arrays: dict[str, Any] = {
+        name: np.asarray(x) for name, x in flatten_dict(to_state_dict(params), sep="/").items()
+    }
     if ABOUT in arrays:
         raise ConfigError(f"{path}: the encoder {spec} has a parameter {ABOUT}, a name that the file needs")
     shape = list(encoder.observation_shape)
@@ -62,8 +64,8 @@ def from_npz(path: str | os.PathLike[str]) -> tuple[Encoder, Params]:
             this code; one line.
     """
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
+            arrays = {name: content[name] for name in content.files}
         about = json.loads(str(arrays.pop(ABOUT)))
         spec, shape = str(about["encoder"]), tuple(map(int, about["observation_shape"]))
     except OSError as error:
