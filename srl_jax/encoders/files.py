@@ -41,10 +41,11 @@ def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec:
         raise ConfigError(f"{path}: the encoder {spec} has a parameter {ABOUT}, a name that the file needs")
     shape = list(encoder.observation_shape)
     text = {"encoder": spec, "observation_shape": shape, "features": encoder.features, **about}
+    arrays[ABOUT] = np.array(json.dumps(text))
     partial = path.with_name(f".{path.name}.partial")
     try:
         with open(partial, "wb") as file:
-            np.savez(file, **arrays | {ABOUT: np.array(json.dumps(text))})
+            np.savez(file, **arrays)
         os.replace(partial, path)
     except OSError as error:
         partial.unlink(missing_ok=True)
