@@ -82,8 +82,7 @@ def make_valid_run(run: Path) -> None:
 
     from srl_jax.agent import make_agent
     from srl_jax.metrics import MetricsWriter
-
-    from ..train import resolved
+    from srl_jax.training import resolved
 
     config = resolved(Config(**SETTINGS))
     run.mkdir(parents=True)
