@@ -51,13 +51,12 @@ class Disk:
 
         return call
 
-    def write(self, path: Path, pieces: list) -> checkpoint.Entry:
+    def write(self, path: Path, data: bytes | memoryview) -> checkpoint.Entry:
         """`checkpoint.write`, which may find no room for the file, or for its second half."""
         self.operation(f"opening {path.suffix}")
-        data = b"".join(memoryview(piece).cast("B") for piece in pieces)
         path.write_bytes(data[: len(data) // 2])
         self.operation(f"writing {path.suffix}")
-        return _write(path, pieces)
+        return _write(path, data)
 
     def patches(self) -> list:
         """For `mock.patch`."""

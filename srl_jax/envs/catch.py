@@ -14,7 +14,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from srl_jax.envs.base import Form, FrameVectorEnv
+from srl_jax.envs.base import FrameVectorEnv
 from srl_jax.envs.games import BACKGROUNDS
 
 GRID = 84
@@ -153,18 +153,6 @@ class Catch(FrameVectorEnv):
         beside = ball_x - self._paddle
         return (self._reach[0] <= beside) & (beside <= self._reach[1])
 
-    def _forms(self):
-        integers = {
-            "ball_x": (self._left, self._right),
-            "ball_y": (self._left, self._last_row),
-            "drift": (-MAX_DRIFT, MAX_DRIFT),
-            "fall": (int(DROPS[:, 0].min()), int(DROPS[:, 0].max())),
-            "paddle": (PADDLE_LEFT, PADDLE_RIGHT),
-            "episodes": (1, None),
-        }
-        forms = {name: Form(np.int64, (self.num_envs,), *limits) for name, limits in integers.items()}
-        return forms | ({} if self._background is None else self._background.forms())
-
     def _snapshot(self):
         arrays = {
             "ball_x": self._ball_x,
@@ -283,15 +271,6 @@ class Background:
         # Never zero, so that both layers always move.
         speed = rng.integers(1, MAX_SCROLL + 1, size=(2, 2))
         self._velocity[i] = speed * rng.choice((-1, 1), size=(2, 2))
-
-    def forms(self) -> dict[str, Form]:
-        """What `arrays` gives."""
-        number = len(self._time)
-        return {
-            "background_time": Form(np.int64, (number,), 0),
-            "background_offset": Form(np.int64, (number, 2, 2), 0, TORUS - 1),
-            "background_velocity": Form(np.int64, (number, 2, 2), -MAX_SCROLL, MAX_SCROLL),
-        }
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The state by name, not copied."""
