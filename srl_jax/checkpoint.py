@@ -120,11 +120,8 @@ def save(
             shutil.rmtree(left)
         temporary.mkdir()
         files = _write_files(temporary, params, state, base)
-        about = {"format": FORMAT, "frame_shape": list(frame_shape), "num_actions": num_actions}
-        about |= {"env_steps": env_steps, "updates": updates}
-        about["files"] = {name: entry._asdict() for name, entry in files.items()}
-        about["config"] = json.loads(config.to_json())
-        sign(temporary, about)
+        manifest = Manifest(final, config, tuple(frame_shape), num_actions, env_steps, updates, files)
+        sign(temporary, _about(manifest))
         _put_in_place(temporary, final)
         up_to_this = [p for p in _all(home) if int(p.name) <= env_steps]
         for old in up_to_this[:-keep] if keep else ():
@@ -134,7 +131,15 @@ def save(
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise SaveError(f"{final}: not written: {error.strerror or error}") from error
-    return Manifest(final, config, tuple(frame_shape), num_actions, env_steps, updates, files)
+    return manifest
+
+
+def _about(manifest: Manifest) -> dict[str, Any]:
+    """The content of manifest.json."""
+    about = {"format": FORMAT, **manifest._asdict()}
+    del about["path"]
+    files = {name: entry._asdict() for name, entry in manifest.files.items()}
+    return about | {"config": json.loads(manifest.config.to_json()), "files": files}
 
 
 def _write_files(folder: Path, params: Any, state: State | None, base: Manifest | None) -> dict[str, Entry]:
@@ -194,18 +199,17 @@ def slim(manifest: Manifest) -> Manifest:
     """
     final = manifest.path
     temporary = final.parent / f".{final.name}.partial"
-    files = {PARAMS: manifest.files[PARAMS]}
+    slimmed = manifest._replace(files={PARAMS: manifest.files[PARAMS]})
     try:
         temporary.mkdir()
         if not _link(manifest, PARAMS, temporary):
             shutil.copyfile(final / PARAMS, temporary / PARAMS)
-        about = json.loads((final / MANIFEST).read_text(encoding="utf-8"))
-        sign(temporary, about | {"files": {PARAMS: files[PARAMS]._asdict()}})
+        sign(temporary, _about(slimmed))
         _put_in_place(temporary, final)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise SaveError(f"{final}: not rewritten: {error.strerror or error}") from error
-    return manifest._replace(files=files)
+    return slimmed
 
 
 def sign(folder: Path, about: Mapping[str, Any]) -> None:
@@ -401,19 +405,8 @@ def load_into(template: Any, tree: Any, what: str) -> Any:
     return jax.tree.unflatten(jax.tree.structure(template), jax.tree.leaves(restored))
 
 
-def is_part(template: Any, tree: Any) -> bool:
-    """Whether a tree from `load` holds a part of a template's parameters, and nothing else."""
-    from flax import serialization
-
-    whole, found = (
-        {name for name, x in _flat(branch).items() if hasattr(x, "shape")}
-        for branch in (serialization.to_state_dict(template), tree)
-    )
-    return found < whole
-
-
 def _flat(tree: dict[str, Any]) -> dict[str, Any]:
-    """{path: leaf} of nested dicts, as encoder/Conv_0/kernel; an empty dict is a leaf without a shape."""
+    """{path: leaf} of nested dicts, as encoder/Conv_0/kernel; an empty dict is a leaf, too."""
     from flax import traverse_util
 
     return traverse_util.flatten_dict(tree, keep_empty_nodes=True, sep="/")

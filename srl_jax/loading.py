@@ -26,7 +26,7 @@ def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
     manifest = checkpoint.read_manifest(path)
     agent, template = _agent_of(manifest)
     tree = checkpoint.load(manifest)
-    if checkpoint.is_part(template, tree):
+    if tree.keys() < template.keys():
         raise ConfigError(
             f"{manifest.path}: a kept encoder, without a policy; name the run or one of its checkpoints "
             "(srl_jax.loading.load_encoder and --encoder_from take kept encoders)"

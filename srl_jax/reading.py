@@ -38,6 +38,20 @@ def read_bytes(path: str | os.PathLike, limit: int = sys.maxsize) -> bytes:
     return Path(path).read_bytes()
 
 
+def replace_text(path: Path, text: str) -> None:
+    """Writes a file at once, flushed to disk: no process that is killed leaves half of it.
+
+    Raises:
+        OSError: it could not be written; it is as it was.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    with open(partial, "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
+
+
 def parse_json(data: bytes | str, constant: Callable[[str], Any] | None = None) -> Any:
     """Reads one JSON document, in UTF-8 where it is bytes.
 

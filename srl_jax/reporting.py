@@ -1,5 +1,6 @@
 """What a run says of itself: rows of metrics.jsonl, the progress bar, and the means between two rows."""
 
+import contextlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srl_jax.display import Display
-from srl_jax.errors import SaveError
+from srl_jax.errors import saving
 from srl_jax.evaluate import Evaluation
 from srl_jax.metrics import Mark, MetricsWriter
 from srl_jax.progress import Progress
@@ -81,11 +82,9 @@ class Report:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: Any) -> None:
         self.progress.__exit__(kind, error, trace)
-        try:
+        # After an error a row was not written, or worse, and the caller is told that.
+        with saving(self.path, "not closed") if error is None else contextlib.suppress(OSError):
             self._writer.close()
-        except OSError as problem:
-            if error is None:  # else a row was not written, or worse, and whoever called us is told
-                raise SaveError(f"{self.path}: not closed: {problem.strerror}") from problem
 
     @property
     def seconds(self) -> float:
@@ -139,17 +138,13 @@ class Report:
         return mean
 
     def _write(self, kind: str, env_steps: int, updates: int, seconds: float, values: Mapping) -> None:
-        try:
+        with saving(self.path, "a row was not written"):
             self._writer.write(kind, env_steps, updates, seconds, values)
-        except OSError as error:
-            raise SaveError(f"{self.path}: a row was not written: {error.strerror}") from error
 
     def snapshot(self) -> dict[str, Any]:
         """As JSON values; rows written so far are flushed to disk."""
-        try:
+        with saving(self.path, "not flushed"):
             mark = self._writer.mark()
-        except OSError as error:
-            raise SaveError(f"{self.path}: not flushed: {error.strerror}") from error
         return {
             "metrics": mark._asdict(),
             "seconds": self.seconds,

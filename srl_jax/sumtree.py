@@ -24,12 +24,7 @@ class SumTree:
 
         Args:
             capacity: the number of leaves, at least 1.
-
-        Raises:
-            ValueError: capacity is below 1.
         """
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}")
         self.capacity = int(capacity)
         blocks = -(-self.capacity // _BLOCK)
         self._blocks, self._sums = np.zeros((blocks, _BLOCK)), np.zeros(blocks)

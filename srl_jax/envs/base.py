@@ -137,14 +137,10 @@ class FrameVectorEnv(VectorEnv):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
-            ValueError: a seed is larger than int64 holds.
         """
         if not self._started:
             raise ResetNeeded("snapshot before the first reset")
-        try:
-            seeds = np.array(self._seeds, np.int64)
-        except OverflowError:
-            raise ValueError(f"seeds of a snapshot must be below 2**63, got {max(self._seeds)}") from None
+        seeds = np.array(self._seeds, np.int64)
         common = {"seeds": seeds, "ended": self._ended.copy(), "frames_sha256": sha256(self._seen())}
         return common | self._snapshot()
 
@@ -244,14 +240,14 @@ def check_seed(seed: int) -> int:
     """Returns the seed as an int.
 
     Raises:
-        ValueError: it is not a non-negative integer.
+        ValueError: it is not an integer in [0, 2**63), which snapshots keep as int64.
     """
     try:
         seed = operator.index(seed)
     except TypeError:
         raise ValueError(f"seed must be an integer, got {seed!r}") from None
-    if seed < 0:
-        raise ValueError(f"seed must not be negative, got {seed}")
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed must lie in [0, 2**63), got {seed}")
     return seed
 
 
