@@ -91,12 +91,13 @@ class Faults:
         return call
 
     def _writing(self, function: Callable) -> Callable:
-        def write(path: Path, data: bytes | memoryview):
+        def write(path: Path, *pieces):
             kind = path.suffix.removeprefix(".")
             self.point(f"before a file ({kind})")
+            data = b"".join(pieces)
             path.write_bytes(data[: len(data) // 2])
             self.point(f"within a file ({kind})")
-            entry = function(path, data)
+            entry = function(path, *pieces)
             self.point(f"after a file ({kind})")
             return entry
 
