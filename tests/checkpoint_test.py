@@ -320,6 +320,7 @@ class Faults:
 
         class Writing(io.BufferedIOBase):
             def write(_, data):
+                data = memoryview(data).tobytes()
                 size = len(data)
                 write(data[: size - 1])
                 failing(data)
