@@ -27,7 +27,7 @@ class Command(NamedTuple):
 COMMANDS: dict[str, Command] = {
     "train": Command("train an agent", "--preset=catch/joint --out=runs/x"),
     "evaluate": Command("play full games with a trained agent", "runs/x --gif=x.gif"),
-    "resume": Command("go on with a run that was stopped or killed", "runs/x"),
+    "resume": Command("resume a run that was stopped or killed", "runs/x"),
     "sweep": Command("train many agents", "--presets=catch/* --seeds=3 --out=runs/many"),
     "figures": Command("run and draw a figure", "--figure=6.3 --games=Catch"),
     "report": Command("write a page about many runs", "runs --out=report.html"),

@@ -1,6 +1,6 @@
-"""The command line: absl flags made from the fields of Config, and errors of one line.
+"""The command line: absl flags, which are made from the fields of Config, and errors of one line.
 
-Flags are defined here, for the entry points, and nowhere else in the library. Imports no jax.
+Entry points define their flags with these functions; the library defines none. Imports no jax.
 """
 
 import functools
@@ -91,20 +91,20 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
     flags.DEFINE_string(
         "preset",
         None,
-        "named settings, which the flags beside it override; thesis/joint_256+small changes one by another",
+        "named settings; flags beside it override them, a piece behind a + changes them: thesis/joint_256+small",
         flag_values=values,
     )
     flags.DEFINE_string(
         "config",
         None,
-        "config.json of a run, or the run's directory: its settings, which the flags beside it override",
+        "config.json of a run, or the run's directory: its settings, which flags beside it override",
         flag_values=values,
     )
 
 
 def define_runtime_flag(values: flags.FlagValues = flags.FLAGS) -> None:
     """Defines --tune_runtime, see `experiments.runtime`; no field of Config, for it changes no setting."""
-    help_text = "whether to set variables that make jax faster on a CPU, and to restart once if need be"
+    help_text = "auto: set variables that make jax faster on a CPU, restarting once if need be; off: set none"
     define("tune_runtime", Info(str, help_text, choices=("auto", "off")), "auto", values)
 
 

@@ -1,8 +1,8 @@
-"""Goes on with a run that was stopped or killed: `python -m experiments.resume runs/x`.
+"""Resumes a run that was stopped or killed: `python -m experiments.resume runs/x`.
 
-Its config.json has all settings. What may change follows: --steps, which also extends a run that has ended if
-it was trained with --keep_replay; --stop_at_return; --policy_from of a run that lies elsewhere; --import;
-and --tune_runtime.
+The run's config.json has all settings. These flags may follow: --steps, which also extends a run that has
+ended if it was trained with --keep_replay; --stop_at_return; --policy_from of a run that lies elsewhere;
+--import; and --tune_runtime.
 """
 
 import os
@@ -18,7 +18,7 @@ from .sweeping.manifest import FILE
 
 
 def command_line(run: str) -> list[str]:
-    """The flags of training that go on with a run, or with the seeds that one process trained.
+    """The flags of training that resume a run, or the seeds that one process trained.
 
     Args:
         run: its directory, or the one that holds theirs.

@@ -46,7 +46,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
         "resume",
         "off",
         ["off", "auto"],
-        "auto: go on with the run that --out holds from its newest good checkpoint, as if it had not ended",
+        "auto: resume the run that --out holds from its newest good checkpoint, as if it had never stopped",
         flag_values=values,
     )
     flags.DEFINE_boolean("overwrite", False, "delete the run that --out holds first", flag_values=values)

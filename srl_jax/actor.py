@@ -1,4 +1,4 @@
-"""The side of the loop that faces the environments: stacks of frames, policies, schedules, seeds, threads."""
+"""What the loop needs to act: environments, stacks of frames, policies, schedules, seeds, threads."""
 
 import os
 import sys

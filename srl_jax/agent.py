@@ -1,4 +1,4 @@
-"""From a configuration to the functions that it means: encoder, objectives, update, act."""
+"""Builds an agent from a configuration: encoder, objectives, jitted functions that init, update and act."""
 
 import inspect
 from collections.abc import Callable, Collection, Mapping, Sequence

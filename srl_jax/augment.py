@@ -1,4 +1,4 @@
-"""Views of an image."""
+"""Data augmentation: randomly shifted views of a sequence of frames."""
 
 import jax
 import jax.numpy as jnp

@@ -1,8 +1,8 @@
 """Every value that determines a run, each with its unit and its limits. Imports no jax.
 
-The command line's flags are generated from the fields of `Config`, so a new value is one field
-here. The defaults are table 5.1 of the thesis (Guberina & Desta, 2022) and, where the table is
-silent, its code. "Env step" is one agent decision: four emulator frames.
+The command line's flags are generated from the fields of `Config`, so a new value is one new field. The
+defaults are those of table 5.1 of the thesis (Guberina & Desta, 2022) and, where the table is silent, of its
+code. An "env step" is one decision of the agent, which is four emulator frames on Atari.
 """
 
 import dataclasses
@@ -70,42 +70,43 @@ class Config:
         choices=tuple(modes.MODES),
     )  # fmt: skip
     rl: str = _value(
-        str, "rainbow", "RL algorithm, name:key=value,...; :key=value,... changes options of the preset's"
-    )
+        str, "rainbow",
+        "RL algorithm, name:key=value,...; :key=value,... changes options of the preset's algorithm",
+    )  # fmt: skip
     encoder: str = _value(
-        str,
-        "nature",
-        "encoder that all losses share, name:key=value,...; :key=value,... changes the preset's",
-    )
+        str, "nature",
+        "encoder that all losses share, name:key=value,...; :key=value,... changes options of the preset's "
+        "encoder",
+    )  # fmt: skip
     objectives: tuple[str, ...] = _value(
         tuple, (),
-        "representation loss, name:key=value,...; may be repeated; none for none; beside a preset, +name:... "
-        "adds one to its own, or replaces the one of that name, and -name leaves one out",
+        "representation loss, name:key=value,...; may be repeated; none stands for no loss; beside a preset, "
+        "+name:... adds a loss or replaces the one of that name, and -name leaves that one out",
         flag="objective",
     )  # fmt: skip
     augment: str = _value(
-        str, "none", "random shift of the frames that these losses see (srl: the representation's)",
+        str, "none", "which losses see randomly shifted frames; srl: the representation losses",
         choices=("none", "srl", "all"),
     )  # fmt: skip
     srl_every: int = _value(
-        int, 1, "updates from one with representation losses to the next", "updates", minimum=1
+        int, 1, "representation losses are computed in every k-th update", "updates", minimum=1
     )
     encoder_optimizer: str = _value(
         str, "separate",
-        "how the encoder is stepped where RL and representation both train it; separate: RL's Adam, then the "
-        "representation's own on a fresh encoding, as the thesis' code; simultaneous: both at the same "
-        "parameters; summed: one Adam on the sum",
+        "how the encoder is stepped where RL and representation both train it; separate: RL's Adam steps, "
+        "then the representation's own Adam on a fresh encoding, as in the thesis' code; simultaneous: both "
+        "Adams take gradients at the same parameters; summed: one Adam steps on the summed loss",
         choices=modes.ENCODER_OPTIMIZERS,
     )  # fmt: skip
     target_encoder: str = _value(
-        str, "slow", "encoder under the target network: its slow copy, or the online one",
+        str, "slow", "encoder under the target network: its slow copy, or the online encoder",
         choices=("slow", "online"),
     )  # fmt: skip
-    seed: int = _value(int, 0, "seed of everything random", minimum=0, maximum=2**31 - 1)
+    seed: int = _value(int, 0, "seed of all random numbers", minimum=0, maximum=2**31 - 1)
 
     steps: int = _steps(5_000_000, "length of the run")
     num_envs: int = _value(
-        int, 10, "training environments; each moves one env step between updates", "environments",
+        int, 10, "training environments; each takes one env step in a round of the loop", "environments",
         minimum=1, maximum=10_000,
     )  # fmt: skip
     buffer_size: int = _steps(100_000, "capacity of the replay buffer", unit="transitions")
@@ -113,79 +114,79 @@ class Config:
     updates_per_step: float = _value(
         float, 0.1, "gradient updates for each env step", "updates per env step", above=0, maximum=1_000
     )
-    learn_start: int = _steps(320, "when learning starts", minimum=0)
+    learn_start: int = _steps(320, "env steps before the first update", minimum=0)
     gamma: float = _share(0.99, "discount", "per env step")
 
     lr_rl: float = _value(float, 1e-4, "Adam's learning rate of the RL head", minimum=0)
     lr_srl: float = _value(float, 1e-4, "Adam's learning rate of the representation heads", minimum=0)
     lr_encoder: float = _value(
         float, 0.0,
-        "Adam's learning rate of the encoder; 0: lr_rl where RL trains it, else lr_srl",
+        "Adam's learning rate of the encoder; 0: lr_rl where RL trains it, otherwise lr_srl",
         minimum=0,
     )  # fmt: skip
     lr_encoder_srl: float = _value(
         float, 0.0,
-        "learning rate of the encoder's second Adam, the representation's, where it has two; 0: lr_srl",
+        "learning rate of the representation's Adam of the encoder, where the encoder has two; 0: lr_srl",
         minimum=0,
     )  # fmt: skip
     lr_final_share: float = _share(
-        1.0, "share of all learning rates that is left at the end of the run; they fall linearly", "share"
+        1.0, "share of each learning rate that is left at the end of the run; rates fall linearly", "share"
     )
     decoder_weight_decay: float = _value(
         float, 1e-7, "L2 weight decay of the decoders, added before Adam's scaling", minimum=0
     )
     max_grad_norm: float = _value(
-        float, 0.0, "global gradient norm that updates are clipped to; 0: no clipping", minimum=0
+        float, 0.0, "global norm that gradients are clipped to; 0: no clipping", minimum=0
     )
     adam_eps: float = _value(float, 1e-8, "Adam's epsilon", minimum=1e-37)
 
-    beta: float = _share(0.4, "importance weights' exponent at the start", "exponent")
-    beta_final: float = _share(1.0, "importance weights' exponent at the end", "exponent")
+    beta: float = _share(0.4, "exponent of the importance weights at the start", "exponent")
+    beta_final: float = _share(1.0, "exponent of the importance weights at the end", "exponent")
     beta_anneal_steps: int = _steps(5_000_000, "length of beta's linear schedule")
-    eps_train: float = _share(1.0, "epsilon of the training policy at the start")
-    eps_final: float = _share(0.05, "epsilon of the training policy at the end")
+    eps_train: float = _share(1.0, "epsilon of the behaviour policy at the start")
+    eps_final: float = _share(0.05, "epsilon of the behaviour policy at the end")
     eps_anneal_steps: int = _steps(1_000_000, "length of epsilon's linear schedule")
-    eps_eval: float = _share(0.005, "epsilon at evaluation")
-    slow_update_every: int = _steps(500, "updates between two copies to the slow network", unit="updates")
+    eps_eval: float = _share(0.005, "epsilon in evaluations")
+    slow_update_every: int = _steps(500, "RL's slow copies are replaced in every k-th update", unit="updates")
 
     eval_every: int = _steps(100_000, "env steps between two evaluations of the policy (one epoch)")
-    eval_games: int = _value(int, 10, "full games of one evaluation", "games", minimum=1)
+    eval_games: int = _value(int, 10, "full games in one evaluation", "games", minimum=1)
     eval_max_steps: int = _value(
-        int, 27_000, "longest evaluation game (27,000 are 108,000 frames)", "env steps",
+        int, 27_000, "length at which an evaluation game is cut (27,000 are 108,000 frames)", "env steps",
         minimum=1, maximum=specs.LIMITS[int] // envs.FRAME_SKIP,
     )  # fmt: skip
     stop_at_return: float | None = _value(
-        float, None, "mean evaluation return that ends the run early, or off", "unclipped score",
+        float, None, "mean evaluation return at which the run ends early, or off", "unclipped score",
         optional=True,
     )  # fmt: skip
     log_every: int = _steps(1_000, "env steps between two train rows of metrics.jsonl")
     checkpoint_every: int = _steps(
-        0, "env steps between two checkpoints; 0: as between evaluations", minimum=0
+        0, "env steps between two checkpoints; 0: as often as evaluations", minimum=0
     )
     keep_encoder_every: int = _value(
-        int, 0, "checkpoints between two whose encoder is kept in encoders/; 0: none is", "checkpoints",
+        int, 0, "the encoder of every k-th checkpoint is kept in encoders/; 0: none is", "checkpoints",
         minimum=0,
     )  # fmt: skip
-    keep_best: bool = _value(bool, True, "the parameters of the best evaluation so far are kept in best/")
+    keep_best: bool = _value(bool, True, "keep the parameters of the best evaluation so far in best/")
     keep_replay: bool = _value(
-        bool, False, "the last checkpoint holds replay, too, so that a finished run can be extended"
+        bool, False, "keep replay in the last checkpoint, so that a finished run can be extended"
     )
     diagnostics: bool = _value(
         bool, True, "measure the latent at each evaluation: drift, rank, gradient conflict, probes"
     )
     diagnostics_kept: int = _value(
-        int, 10, "how many epochs' encoders and decoders are kept in encoders/, to measure drift against",
+        int, 10, "epochs whose encoders and decoders are kept in encoders/, to measure drift against",
         "epochs", minimum=0, maximum=1_000,
     )  # fmt: skip
     tensorboard: bool = _value(bool, False, "also write TensorBoard events")
 
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
-    life_loss: bool = _value(bool, True, "a lost life ends the return (not the game) in training")
-    sticky_actions: float = _share(0.0, "that the emulator repeats the last action")
+    life_loss: bool = _value(bool, True, "a lost life ends the return, but not the game, in training")
+    sticky_actions: float = _share(0.0, "the emulator repeats the last action with this probability")
     noop_max: int = _value(
         int,
         30,
-        "random no-ops at the start of a game are fewer than this",
+        "a game starts with fewer random no-ops than this",
         "emulator frames",
         minimum=0,
         maximum=1_000,
@@ -193,25 +194,25 @@ class Config:
     frame_size: int = _value(
         int,
         84,
-        "height and width of a frame, to which others are resized; 0: a gymnasium environment's own; Catch "
-        "knows 42 and 84",
+        "height and width that frames are resized to; 0: as large as the gymnasium environment's own; Catch "
+        "has 42 and 84",
         "pixels",
         minimum=0,
         maximum=1_024,
     )
     frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1, maximum=256)
 
-    encoder_from: str = _value(str, "", "run directory or checkpoint that the encoder starts from")
+    encoder_from: str = _value(str, "", "run directory or checkpoint whose encoder this run starts from")
     heads_from: str = _value(
         str, "representation",
-        "heads that also start from --encoder_from, where both runs have them: decoders and other "
-        "representation heads; all: RL's, too",
+        "heads that also start from --encoder_from, where both runs have them; representation: decoders and "
+        "other representation heads; all: RL's head, too",
         choices=("representation", "all", "none"),
     )  # fmt: skip
     policy_from: str = _value(
-        str, "", "run directory or checkpoint whose policy --mode=pretrain acts with; empty: random"
+        str, "", "run directory or checkpoint whose policy acts in --mode=pretrain; empty: a random policy"
     )
-    pretrain_epsilon: float = _share(0.3, "epsilon of the policy that --mode=pretrain acts with")
+    pretrain_epsilon: float = _share(0.3, "epsilon of the behaviour policy in --mode=pretrain")
     imports: tuple[str, ...] = _value(
         tuple, (),
         "file (my_file.py) or module that registers objectives, encoders or RL algorithms of your own, see "

@@ -1,4 +1,4 @@
-"""Streams that show how things go: one that is closed, goes away or knows too few letters ends nothing."""
+"""Output for whoever watches. A stream that is closed, vanishes or lacks characters ends no run."""
 
 import errno
 import io

@@ -1,7 +1,7 @@
-"""How a run ended, as its directory says it: ended.json. Imports no jax.
+"""How a run ended: the file ended.json in its directory. Imports no jax.
 
-Written by the process that ends, and removed where a run is gone on with. So a run without one is under way,
-or it was killed.
+The process that ends writes the file, and a resumed run removes it. A run without one is under way, or was
+killed.
 """
 
 import json
@@ -63,7 +63,7 @@ def write(run: Path, ending: Ending) -> None:
 
 
 def read(run: Path) -> Ending | None:
-    """How the run in a directory ended; None where it is under way, or was killed, or is of before.
+    """How the run in a directory ended; None where it is under way, was killed, or is older than this file.
 
     Raises:
         ConfigError: the file cannot be read, or says something else.

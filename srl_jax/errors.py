@@ -1,4 +1,4 @@
-"""What a run may end with, apart from its end: errors of one line, each with an exit status of its own."""
+"""The errors that may end a run: each has one line, and an exit status of its own."""
 
 import contextlib
 import os

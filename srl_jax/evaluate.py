@@ -1,4 +1,4 @@
-"""Full games, unclipped scores."""
+"""Evaluation of a policy: full games, with unclipped scores."""
 
 from collections.abc import Callable
 from typing import NamedTuple

@@ -1,9 +1,9 @@
-"""The host loop, of one seed or of several in step: act, step, add, sample, update; evaluate and checkpoint.
+"""The host loop of one seed, or of several in step: act, step, add, sample, update; evaluate and checkpoint.
 
-The device's state has an axis of seeds (`srl_jax.agent.over_seeds`), the host keeps a `Seed` each. Threads of
-the environments act, step and reset while the main thread has the device update. Both start from the
-parameters and the replay of the step before and meet before the next one. Evaluations have threads, too, and
-are awaited before the next row is written. So no result depends on timing.
+The device's state has an axis of seeds (`srl_jax.agent.over_seeds`), and the host keeps a `Seed` for each.
+Threads act, step and reset the environments while the main thread has the device update. Both start from the
+parameters and the replay of the step before, and they meet before the next step. Evaluations have threads of
+their own and are awaited before the next row is written. So no result depends on timing.
 """
 
 import contextlib

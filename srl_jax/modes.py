@@ -1,4 +1,4 @@
-"""The training modes: what runs, where the encoder starts and who may train it. Imports no jax.
+"""The training modes: which losses run, where the encoder starts, and which train it. Imports no jax.
 
 A mode is a row of `MODES`; the thesis' hypothesis 1 compares them.
 """
@@ -44,15 +44,15 @@ MODES = {
         Mode("rl_only", True, False, "scratch", True, False, "RL alone"),
         Mode(
             "pretrain", False, True, "either", False, True,
-            "representation losses alone, on frames from a random or a trained policy",
+            "representation losses alone, on frames of a random or a trained behaviour policy",
         ),
         Mode(
             "frozen", True, False, "checkpoint", False, False,
-            "RL on a pretrained encoder that no longer moves",
+            "RL on a pretrained encoder that stays frozen",
         ),
         Mode(
             "finetuned", True, False, "checkpoint", True, False,
-            "RL on a pretrained encoder that RL goes on training",
+            "RL on a pretrained encoder, which RL trains further",
         ),
         Mode(
             "joint", True, True, "either", True, True,

@@ -1,4 +1,4 @@
-"""Rows of one's own in the registries: objectives, encoders, RL algorithms. Imports no jax.
+"""Registries, and how a user's own file adds rows to them. Imports no jax.
 
 A file registers what it has when it is imported:
 

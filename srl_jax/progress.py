@@ -1,4 +1,4 @@
-"""A progress bar on standard error: how far, how fast, how well, how long still."""
+"""A progress bar on standard error: env steps, speed, time left, losses and returns."""
 
 import math
 import shutil

@@ -1,4 +1,4 @@
-"""What a run says of itself: rows of metrics.jsonl, the progress bar, and the means between two rows."""
+"""Reports of a run: rows of metrics.jsonl, the progress bar, and the means between two rows."""
 
 import contextlib
 import time

@@ -1,4 +1,4 @@
-"""Run directories: making one, which has one writer at a time."""
+"""Run directories: how one is made, and the lock that gives it one writer at a time."""
 
 import contextlib
 import fcntl

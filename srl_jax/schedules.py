@@ -1,4 +1,4 @@
-"""The numbers of a run that change with its env steps: functions of a configuration and a count."""
+"""Schedules: numbers that change with env steps, as functions of a configuration and a count."""
 
 from typing import NamedTuple
 

@@ -2,7 +2,7 @@
 
 A registry is a dict from a name to a factory: a function, or a functools.partial of one. The
 factory's keyword-only parameters are the options, and their defaults give both the default and the
-type. So a new option needs no new flag, and a typo is an error that lists what there is.
+type. So a new option needs no new flag, and a typo is answered with a list of what there is.
 """
 
 import dataclasses

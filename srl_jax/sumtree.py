@@ -1,7 +1,8 @@
 """A sum tree in numpy: set priorities and draw in proportion to them, many at a time.
 
-It has two levels, leaves in blocks of 64 and the blocks' sums, rather than 17 or 20: a numpy call on 30
-numbers costs about as much as one on 2,000, and a running sum over the 1,563 blocks of 100,000 leaves is one.
+The tree has two levels, leaves in blocks of 64 and the sums of the blocks, rather than 17 or 20 levels: a
+numpy call on 30 numbers costs about as much as one on 2,000, and a running sum over the 1,563 blocks of
+100,000 leaves is one call.
 """
 
 import numpy as np

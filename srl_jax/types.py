@@ -1,4 +1,4 @@
-"""The nouns of the project: what moves between replay, update and the losses.
+"""The types of the project: what moves between replay, update and the losses.
 
 Shapes use B for batch, S for stacked frames (4), K for the window's horizon, H, W and C for a frame's height,
 width and channels (1 grey, 3 colour), D for the latent's size. An observation has S * C channels, frame by

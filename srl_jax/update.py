@@ -1,4 +1,4 @@
-"""make_init, make_update, make_conflict and make_act: where losses are summed and the encoder is stepped."""
+"""The update of an agent: where losses are summed and the encoder is stepped; also how it starts and acts."""
 
 import math
 import zlib
@@ -17,7 +17,7 @@ from srl_jax.types import Array, Encoder, Latents, Objective, Offsets, Params, T
 from srl_jax.window import observation, stack_last
 
 NORM_EVERY = 10
-"""Norms of the encoder's gradients and steps, passes over them, are metrics of every so many updates."""
+"""k: norms of the encoder's gradients and steps, each a pass over them, are metrics of every k-th update."""
 
 
 class Hyper(NamedTuple):
@@ -38,7 +38,7 @@ def named_key(key: jax.Array, name: str) -> jax.Array:
 
 
 def periodic(every: int) -> Callable:
-    """The rule of a slow copy that is replaced by the original every so many updates."""
+    """The rule of a slow copy that the original replaces in every k-th update; k is `every`."""
 
     def follow(new: Params, old: Params, step: Array) -> Params:
         return jax.lax.cond(step % every == 0, lambda: new, lambda: old)
@@ -203,8 +203,8 @@ def make_update(
         importance weights), `loss/total`, `NAME/...` of each objective's own; `grad_norm/encoder` (where it
         moves) and `grad_norm/all` (where gradients are clipped; before that), with `_srl` behind them in the
         second of two passes, and `step_ratio/encoder`, the length of the second pass' step of the encoder
-        over the first's. Those of the encoder are `srl_jax.optim.NOT_MEASURED` but in every `NORM_EVERY`th
-        update.
+        over the first's. Those of the encoder are `srl_jax.optim.NOT_MEASURED` but in every k-th
+        update, k being `NORM_EVERY`.
     """
 
     if augment not in ("none", "srl", "all"):
