@@ -91,7 +91,7 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
     flags.DEFINE_string(
         "preset",
         None,
-        "named settings; flags beside it override them, pieces behind a + change them: thesis/joint_256+small",
+        "named settings; flags beside it override them, pieces behind + change them: thesis/joint_256+small",
         flag_values=values,
     )
     flags.DEFINE_string(
