@@ -39,4 +39,4 @@ class Dot(gymnasium.Env):
         return frame.repeat(4, 0).repeat(4, 1), {"state": np.concatenate((self.dot, self.place))}
 
 
-gymnasium.register("Dot-v0", Dot, max_episode_steps=100)
+gymnasium.register("Dot-v0", f"{__name__}:Dot", max_episode_steps=100)

@@ -3,7 +3,6 @@
 import contextlib
 import os
 import re
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -164,49 +163,6 @@ def _is_config(file: Path) -> bool:
     except (OSError, ValueError):
         return False
     return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()
-
-
-@contextlib.contextmanager
-def run_directory(path: Path, config: Config) -> Iterator[None]:
-    """Makes the run directory with its config.json; unmakes it if what follows refuses the config.
-
-    Args:
-        path: as `check_out` returned it; a run that lies there is deleted.
-        config: resolved; written to config.json.
-
-    Raises:
-        ConfigError: it cannot be made, or another process writes there.
-        SaveError: config.json could not be written.
-    """
-    made, written = [], False
-    try:
-        try:
-            missing = [p for p in (path, *path.absolute().parents) if not p.exists()]
-            for directory in reversed(missing):
-                directory.mkdir()
-                made.append(directory)
-        except OSError as error:
-            raise ConfigError(f"--out={path}: {error.strerror}") from None
-        with rundir.held(path):
-            try:
-                for old in path.iterdir():
-                    # The old config.json stays until the new one replaces it: it says that this is a run.
-                    if old.name not in (rundir.LOCK, "config.json"):
-                        shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
-                config.save(path)
-                written = True
-            except OSError as error:
-                raise SaveError(f"--out={path}: {error.strerror}") from None
-            yield
-    except ConfigError:
-        # Only what was made here goes: once anything else lies there, all of it stays.
-        with contextlib.suppress(OSError):
-            if written and [file.name for file in path.iterdir()] == ["config.json"]:
-                (path / "config.json").unlink()
-        with contextlib.suppress(OSError):
-            for directory in reversed(made):
-                directory.rmdir()
-        raise
 
 
 def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifest | None:

@@ -6,11 +6,10 @@ Prints one JSON object: the game, the checkpoint's env steps, the mean, and ever
 import functools
 import json
 from collections.abc import Callable
-from pathlib import Path
 
 from absl import flags
 
-from srl_jax import display, plugins
+from srl_jax import display
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
 
@@ -30,19 +29,7 @@ def check_gif(path: str) -> None:
 
     if not plots.available():
         raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
-    if Path(path).suffix.lower() != ".gif":
-        raise ConfigError(f"--gif={path}: must end in .gif")
-    config_flags.check_name("gif", path)
-    try:
-        Path(path).lstat()
-    except FileNotFoundError:
-        pass
-    except OSError as error:
-        raise ConfigError(f"--gif={path}: {error.strerror}") from None
-    else:
-        raise ConfigError(f"--gif={path}: exists; name a new file")
-    if not Path(path).absolute().parent.is_dir():
-        raise ConfigError(f"--gif={path}: no such directory")
+    config_flags.check_file("gif", path, ".gif")
 
 
 def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> None:
@@ -74,8 +61,8 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     from srl_jax import actor, loading
     from srl_jax.evaluate import evaluate
 
-    plugins.load(map(plugins.located, FLAGS["import"].value or config.imports))
-    agent, params, manifest = loading.load_agent(FLAGS.run)
+    loaded = loading.load(FLAGS.run, imports=FLAGS["import"].value)
+    policy, manifest = loaded.policy(jax.random.key(FLAGS.seed)), loaded.manifest
     number = min(FLAGS.games, config.num_envs)
     env = actor.make_env(config, "eval", number, seed=FLAGS.seed)
     if manifest.num_actions != env.single_action_space.n:
@@ -86,7 +73,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     shape = env.single_observation_space.shape
     checkpoint.check_frames(manifest, shape, str(manifest.path), config.game)
     played = evaluate(
-        loading.greedy_policy(agent, params, jax.random.key(FLAGS.seed)),
+        policy,
         env,
         games=FLAGS.games,
         seed=FLAGS.seed,
@@ -109,18 +96,24 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     display.result(json.dumps(result))
 
 
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines this entry point's flags."""
+    flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", flag_values=values)
+    games = Info(int, "full games to play", minimum=1, maximum=1_000_000)
+    config_flags.define("games", games, 10, values)
+    seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
+    config_flags.define("seed", seed, 0, values)
+    epsilon = "probability of a random action; the run's eps_eval if not given"
+    config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None, values)
+    config_flags.define_import_flag(values)
+    gif = "file to write the first game to, as a GIF"
+    flags.DEFINE_string("gif", "", gif, flag_values=values)
+    config_flags.define_runtime_flag(values)
+
+
 def cli() -> None:
     """Runs this entry point as a program."""
-    flags.DEFINE_string("run", "", "run directory, or one of its checkpoints")
-    config_flags.define("games", Info(int, "full games to play", minimum=1, maximum=1_000_000), 10)
-    seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
-    config_flags.define("seed", seed, 0)
-    epsilon = "probability of a random action; the run's eps_eval if not given"
-    config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None)
-    imports = "what to import in place of what the run's config.json names; may be repeated"
-    flags.DEFINE_multi_string("import", None, imports)
-    flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF")
-    config_flags.define_runtime_flag()
+    define_flags()
     config_flags.run(functools.partial(main, prepare=runtime.prepare), positional="run")
 
 

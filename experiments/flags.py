@@ -91,7 +91,7 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
     flags.DEFINE_string(
         "preset",
         None,
-        "named settings; flags beside it override them, and a piece behind a + changes them: demo+textbook",
+        "named settings; flags beside it override them, pieces behind + change them: thesis/joint_256+small",
         flag_values=values,
     )
     flags.DEFINE_string(
@@ -106,6 +106,12 @@ def define_runtime_flag(values: flags.FlagValues = flags.FLAGS) -> None:
     """Defines --tune_runtime, see `experiments.runtime`; no field of Config, for it changes no setting."""
     help_text = "auto: set variables that make jax faster on a CPU, restarting once if need be; off: set none"
     define("tune_runtime", Info(str, help_text, choices=("auto", "off")), "auto", values)
+
+
+def define_import_flag(values: flags.FlagValues = flags.FLAGS) -> None:
+    """Defines --import of programs that read a run; None where it was not given."""
+    help_text = "what to import in place of what the run's config.json names; may be repeated"
+    flags.DEFINE_multi_string("import", None, help_text, flag_values=values)
 
 
 def _base(values: flags.FlagValues, game: str | None) -> tuple[dict[str, Any], str]:
@@ -260,6 +266,38 @@ def check_place(flag: str, text: str) -> Path:
             raise ConfigError(f"--{flag}={text}: no permission to write in {parent}")
     except OSError as error:
         raise ConfigError(f"--{flag}={text}: {error.strerror}") from None
+    return path
+
+
+def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = None) -> Path:
+    """The path of a file that is to be made, in a directory that is there; writes nothing.
+
+    Args:
+        flag: that it came from.
+        text: its value, with or without ~.
+        suffix: what it has to end in.
+        overwrite: whether a file may be there already; None where no flag allows it.
+
+    Raises:
+        ConfigError: it has another name, or something lies there, or the directory does not.
+    """
+    path = Path(os.path.expanduser(text))
+    if path.suffix.lower() != suffix:
+        raise ConfigError(f"--{flag}={text}: must end in {suffix}")
+    check_name(flag, text)
+    try:
+        there = os.path.lexists(path)
+        if there and not overwrite:
+            hint = "" if overwrite is None else ", or --overwrite replaces it"
+            raise ConfigError(f"--{flag}={text}: exists; name a new file{hint}")
+        if there and not path.is_file():
+            raise ConfigError(f"--{flag}={text}: exists and is not a file")
+        if not path.absolute().parent.is_dir():
+            raise ConfigError(f"--{flag}={text}: no such directory")
+    except (OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
+        raise ConfigError(f"--{flag}={text}: {getattr(error, 'strerror', error)}") from None
     return path
 
 

@@ -16,15 +16,15 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax import display, envs, plugins
-from srl_jax.config import INFOS, SOURCES, Config, resolve
+from srl_jax import display, envs
+from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.rundir import check_free
-from srl_jax.specs import build, parse
+from srl_jax.rundir import check_free, run_directory
+from srl_jax.training import check_game, resolved
 
 from . import flags as config_flags
 from . import runtime
-from .directories import all_to_resume, check_out, going_on, run_directory, say_anew
+from .directories import all_to_resume, check_out, going_on, say_anew
 from .stopping import signals
 
 FLAGS = flags.FLAGS
@@ -83,27 +83,9 @@ def check_extras(config: Config) -> None:
     Raises:
         ConfigError: they cannot; the line says why, or which extra has the package.
     """
-    check_game(config, imported=False)
+    check_game(config)
     if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
         raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
-
-
-def check_game(config: Config, imported: bool) -> None:
-    """Whether the game's environments can be made here; one of a plug-in is known once that is `imported`.
-
-    Raises:
-        ConfigError: they cannot; the line says why.
-    """
-    try:
-        game = envs.game(config.game)
-    except ConfigError:
-        if imported or not config.imports:
-            raise
-        return
-    try:
-        game.check()
-    except ConfigError as error:
-        raise ConfigError(f"--game={config.game}: {error}") from None
 
 
 def say_unused(values: flags.FlagValues, game: str) -> None:
@@ -128,33 +110,6 @@ def check_paths(config: Config) -> None:
 def interrupt() -> None:
     """Ends a run in the middle of a step, without another checkpoint."""
     raise KeyboardInterrupt
-
-
-def resolved(config: Config) -> Config:
-    """`srl_jax.config.resolve` with the registries and what --import adds, and a trial build; imports jax.
-
-    Raises:
-        ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
-            these frames.
-    """
-    from srl_jax import encoders, objectives, rl
-    from srl_jax.types import Context
-
-    if config.imports:
-        plugins.load(config.imports)
-        check_game(config, imported=True)
-    full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
-    # Options may be valid one by one and not together, or not for these frames: only a factory
-    # knows. The number of actions is not known yet; any will do for that.
-    size = config.frame_size or 84  # an environment's own is known once it is made
-    shape = (size, size, config.frame_stack)
-    encoder = build(parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
-    context = Context.of(encoder, num_actions=18)
-    build(parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
-    for text in config.objectives:
-        objective = parse(text, objectives.REGISTRY, "objective")
-        build(objective, objectives.REGISTRY, context)
-    return full
 
 
 def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = None) -> int:

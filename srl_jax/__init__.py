@@ -1,3 +1,50 @@
-"""State representation learning for model-free reinforcement learning from pixels, in JAX."""
+"""State representation learning for model-free reinforcement learning from pixels, in JAX.
+
+    import srl_jax
+
+    result = srl_jax.train(srl_jax.Config(game="Catch", steps=20_000), "runs/x")
+    policy = srl_jax.load("runs/x")
+    actions = policy.act(observations)  # uint8 [B, H, W, S * C] -> int32 [B]
+
+`losses`, `objectives`, `encoders` and `Replay` are parts for a loop of one's own. Each name is imported when
+it is first asked for; `import srl_jax` itself and `Config` import no jax.
+"""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from srl_jax import encoders, objectives
+    from srl_jax.config import Config
+    from srl_jax.loading import load
+    from srl_jax.replay import Replay
+    from srl_jax.rl import losses
+    from srl_jax.training import train
+else:  # a checker would take any name for one that is there
+
+    def __getattr__(name: str) -> Any:
+        if name not in _MODULES:
+            raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+        module = importlib.import_module(_MODULES[name])
+        value = module if module.__name__.endswith(f".{name}") else getattr(module, name)
+        globals()[name] = value
+        return value
+
 
 __version__ = "0.1.0"
+__all__ = ["Config", "Replay", "__version__", "encoders", "load", "losses", "objectives", "train"]
+
+_MODULES = {
+    "Config": "srl_jax.config",
+    "Replay": "srl_jax.replay",
+    "encoders": "srl_jax.encoders",
+    "load": "srl_jax.loading",
+    "losses": "srl_jax.rl.losses",
+    "objectives": "srl_jax.objectives",
+    "train": "srl_jax.training",
+}
+"""Where each name is: a module of that name, or the module that has it."""
+
+
+def __dir__() -> list[str]:
+    return __all__

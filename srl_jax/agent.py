@@ -1,10 +1,12 @@
 """Builds an agent from a configuration: encoder, objectives, jitted functions that init, update and act."""
 
-from collections.abc import Callable, Collection, Sequence
-from typing import Any, NamedTuple
+import inspect
+from collections.abc import Callable, Collection, Mapping, Sequence
+from typing import Any, NamedTuple, Protocol, cast
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 
 from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
@@ -12,7 +14,7 @@ from srl_jax.diagnostics.device import Functions, make_functions
 from srl_jax.modes import MODES, Mode, encoder_learning_rate, second_learning_rate
 from srl_jax.optim import RL, make_optimizer
 from srl_jax.rl import Algorithm
-from srl_jax.types import Context, Encoder, Objective, TrainState, Window
+from srl_jax.types import Array, Context, Encoder, Objective, Params, TrainState, Window
 from srl_jax.update import (
     Hyper,
     Pass,
@@ -26,9 +28,41 @@ from srl_jax.update import (
 )
 
 
+class Init(Protocol):
+    """The type of `Agent.init`: see `srl_jax.update.make_init`."""
+
+    def __call__(self, key: jax.Array, given: Mapping[str, Params] | None = None, /) -> TrainState: ...
+
+
+class Act(Protocol):
+    """The type of `Agent.act`: (params, frames uint8 [N, S, H, W, C], key, step, epsilon) -> int32 [N]."""
+
+    def __call__(
+        self,
+        params: Mapping[str, Params],
+        frames: Array,
+        key: jax.Array,
+        step: ArrayLike,
+        epsilon: ArrayLike,
+        /,
+    ) -> jax.Array: ...
+
+
+class Update(Protocol):
+    """The type of `Agent.update`; its attributes are those of `jit_update`."""
+
+    pure: Callable
+    compiled: Callable
+    lifted: Callable[[Callable[[Callable], Callable]], "Update"]
+
+    def __call__(
+        self, state: TrainState, window: Window, hyper: Hyper, /
+    ) -> tuple[TrainState, jax.Array | None, dict[str, jax.Array]]: ...
+
+
 def jit_update(
     update: Callable, plan: Sequence[Pass], lift: Callable[[Callable], Callable] = lambda change: change
-) -> Callable:
+) -> Update:
     """Jits an update, (state, window, hyper) -> (state, td_error, metrics), so that nothing is copied.
 
     The optimizer's state of the groups that move is taken over. Parameters are not: they may still act. What
@@ -65,9 +99,10 @@ def jit_update(
         (*moved, step), td_error, metrics = compiled(*part(state, True), rest, window, hyper)
         return put(state, moved)._replace(step=step), td_error, metrics
 
-    jitted.pure, jitted.compiled = update, compiled
-    jitted.lifted = lambda lift: jit_update(update, plan, lift)
-    return jitted
+    result = cast(Update, jitted)
+    result.pure, result.compiled = update, compiled
+    result.lifted = lambda lift: jit_update(update, plan, lift)
+    return result
 
 
 class Agent(NamedTuple):
@@ -96,19 +131,19 @@ class Agent(NamedTuple):
     algorithm: Algorithm
     objectives: dict[str, Objective]
     horizon: int
-    init: Callable
-    update: Callable
-    update_rl: Callable | None
-    follow: Callable
+    init: Init
+    update: Update
+    update_rl: Update | None
+    follow: Callable[[TrainState], TrainState]
     follow_every: int
-    act: Callable
-    act_eval: Callable
-    shapes: Callable
+    act: Act
+    act_eval: Act
+    shapes: Callable[[], TrainState]
     hyper: Hyper
     measures: Functions
 
 
-def make_agent(config: Config, frame_shape: tuple, num_actions: int) -> Agent:
+def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: int) -> Agent:
     """Builds an `Agent`.
 
     Args:
@@ -146,7 +181,7 @@ def make_agent(config: Config, frame_shape: tuple, num_actions: int) -> Agent:
         "representation": config.lr_srl,
     }
 
-    def jitted_update(only: Collection[str]) -> Callable:
+    def jitted_update(only: Collection[str]) -> Update:
         update = make_update(
             encoder,
             terms,
@@ -161,7 +196,7 @@ def make_agent(config: Config, frame_shape: tuple, num_actions: int) -> Agent:
         plan = passes(mode, [name for name in terms if name in only], config.encoder_optimizer)
         return jit_update(update, plan)
 
-    def jitted_act(noisy: bool):
+    def jitted_act(noisy: bool) -> Act:
         act = make_act(encoder, algorithm.q_values, noisy=noisy)
         return jax.jit(lambda params, *rest: act(params["encoder"], params[RL], *rest))
 
@@ -256,7 +291,7 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
             opt_state, params, rest, stacked(windows), hyper
         )
 
-    act = jax.vmap(agent.act.__wrapped__, in_axes=(0, 0, 0, None, None))
+    act = jax.vmap(inspect.unwrap(agent.act), in_axes=(0, 0, 0, None, None))
 
     def rows(tree: Any) -> list[Any]:
         tree = jax.device_get(tree)
@@ -265,7 +300,7 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
     return Seeds(
         update=agent.update.lifted(lift),
         update_rl=agent.update_rl and agent.update_rl.lifted(lift),
-        follow=jax.jit(jax.vmap(agent.follow.__wrapped__)),
+        follow=jax.jit(jax.vmap(inspect.unwrap(agent.follow))),
         act=jax.jit(lambda params, frames, keys, *now: act(params, jnp.stack(frames), jnp.stack(keys), *now)),
         stack=jax.jit(stacked),
         part=jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree)),

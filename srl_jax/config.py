@@ -18,7 +18,7 @@ from typing import Any
 
 from srl_jax import envs, modes, specs
 from srl_jax.errors import ConfigError
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
+from srl_jax.reading import SETTINGS, parse_json, read_bytes, replace_text
 from srl_jax.specs import Info
 
 _PACKAGES = (
@@ -437,12 +437,7 @@ def _read(run: str | Path) -> tuple[dict[str, Any], dict[str, list[Any]]]:
 
 
 def _write(run: str | Path, content: Mapping[str, Any]) -> None:
-    partial = Path(run) / PARTIAL
-    with open(partial, "w", encoding="utf-8") as file:
-        file.write(json.dumps(content, indent=2) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(partial, Path(run) / "config.json")
+    replace_text(Path(run) / "config.json", json.dumps(content, indent=2) + "\n")
 
 
 def _now() -> str:

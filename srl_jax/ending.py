@@ -4,14 +4,12 @@ The process that ends writes the file, and a resumed run removes it. A run witho
 killed.
 """
 
-import contextlib
 import json
-import os
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax.errors import ConfigError, Diverged, SaveError
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
+from srl_jax.errors import ConfigError, Diverged, SaveError, saving
+from srl_jax.reading import SETTINGS, parse_json, read_bytes, replace_text
 
 FILE = "ended.json"
 STATUSES = ("finished", "stopped", "diverged", "failed")
@@ -60,15 +58,8 @@ def write(run: Path, ending: Ending) -> None:
     Raises:
         SaveError: it could not be written.
     """
-    partial = run / f"{FILE}.partial"
-    try:
-        with open(partial, "w", encoding="utf-8") as file:
-            file.write(json.dumps(ending._asdict()) + "\n")
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, run / FILE)
-    except OSError as error:
-        raise SaveError(f"{run / FILE}: not written: {error.strerror}") from error
+    with saving(run / FILE):
+        replace_text(run / FILE, json.dumps(ending._asdict()) + "\n")
 
 
 def read(run: Path) -> Ending | None:
@@ -102,8 +93,5 @@ def clear(run: Path) -> None:
     Raises:
         SaveError: it cannot be removed.
     """
-    try:
-        with contextlib.suppress(FileNotFoundError):
-            (run / FILE).unlink()
-    except OSError as error:
-        raise SaveError(f"{run / FILE}: not removed: {error.strerror}") from error
+    with saving(run / FILE, "not removed"):
+        (run / FILE).unlink(missing_ok=True)

@@ -1,5 +1,8 @@
 """The errors that may end a run: each has one line, and an exit status of its own."""
 
+import contextlib
+import os
+from collections.abc import Iterator
 from pathlib import Path
 
 
@@ -21,6 +24,15 @@ class Diverged(Exception):
     def __init__(self, message: str, run: Path | None = None):
         super().__init__(message)
         self.run = run
+
+
+@contextlib.contextmanager
+def saving(path: str | os.PathLike, problem: str = "not written") -> Iterator[None]:
+    """Turns an OSError into a SaveError, `PATH: PROBLEM: reason`."""
+    try:
+        yield
+    except OSError as error:
+        raise SaveError(f"{path}: {problem}: {error.strerror or error}") from error
 
 
 EXIT_STATUS = {ConfigError: 2, SaveError: 3, Diverged: 4}

@@ -1,65 +1,152 @@
 """What other programs and other runs take from a checkpoint: an agent, its policy, its encoder."""
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from srl_jax import checkpoint
+from srl_jax import checkpoint, plugins
 from srl_jax.actor import Policy
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.optim import ENCODER, RL
-from srl_jax.types import Encoder, Params
+from srl_jax.types import Array, Encoder, Params
 
 
-def load_agent(path: str | Path) -> tuple[Agent, Any, checkpoint.Manifest]:
-    """An agent, its parameters and the manifest of a checkpoint or of a run's newest one.
+class Loaded:
+    """What a checkpoint holds: an encoder, and its policy where that was kept, as functions of arrays.
+
+    Observations are uint8 [..., H, W, S * C], frame by frame, the newest frame last, or float32 in [0, 1] of
+    that shape: a batch, or one alone, or with more axes in front. Each function is compiled once for each
+    number of observations. To differentiate, take `encoder.apply(params["encoder"], observations)`.
+
+    Attributes:
+        agent: what the configuration means, `srl_jax.agent.Agent`.
+        params: {"encoder": tree, OBJECTIVE: its head's tree}, what the checkpoint holds; RL's is "rl".
+        manifest: of the checkpoint.
+        config: of the run, resolved.
+        encoder: `agent.encoder`.
+        env_steps: after which it was written.
+    """
+
+    def __init__(self, agent: Agent, params: dict[str, Params], manifest: checkpoint.Manifest):
+        self.agent, self.params, self.manifest = agent, params, manifest
+        self.config: Config = manifest.config
+        self.encoder: Encoder = agent.encoder
+        self.env_steps: int = manifest.env_steps
+        self._rng = np.random.default_rng(0)
+
+        def q_values(params: dict[str, Params], observations: Array) -> Array:
+            return agent.algorithm.q_values(params[RL], agent.encoder.apply(params[ENCODER], observations))
+
+        self._encode, self._q_values = jax.jit(agent.encoder.apply), jax.jit(q_values)
+
+    def encode(self, observations: Array) -> jax.Array:
+        """The latents of observations, float32 [..., D].
+
+        Raises:
+            ValueError: the observations have another shape or dtype.
+        """
+        return self._over(lambda x: self._encode(self.params[ENCODER], x), observations)
+
+    def q_values(self, observations: Array) -> jax.Array:
+        """The expected return of each action without noise, float32 [..., A], in units of (clipped) reward.
+
+        Raises:
+            srl_jax.errors.ConfigError: no policy was kept there, but an encoder, or the run trained none.
+            ValueError: the observations have another shape or dtype.
+        """
+        self._check_policy()
+        return self._over(lambda x: self._q_values(self.params, x), observations)
+
+    def act(
+        self, observations: Array, epsilon: float = 0.0, rng: np.random.Generator | None = None
+    ) -> np.ndarray:
+        """Greedy actions, int32 [...]; each with probability epsilon a uniformly random one instead.
+
+        Args:
+            observations: see above.
+            epsilon: in [0, 1].
+            rng: draws where epsilon is above 0; None for one of this object's own, which starts at seed 0.
+
+        Raises:
+            srl_jax.errors.ConfigError, ValueError: see `q_values`.
+        """
+        values = np.asarray(self.q_values(observations))
+        actions = np.argmax(values, -1).astype(np.int32)
+        if epsilon > 0:
+            rng = rng or self._rng
+            random = rng.integers(0, values.shape[-1], actions.shape, np.int32)
+            actions = np.where(rng.random(actions.shape) < epsilon, random, actions)
+        return actions
+
+    def policy(self, key: jax.Array) -> Policy:
+        """The epsilon-greedy policy that evaluations play, see `greedy_policy`.
+
+        Raises:
+            srl_jax.errors.ConfigError: see `q_values`.
+        """
+        self._check_policy()
+        return greedy_policy(self.agent, self.params, key)
+
+    def _check_policy(self) -> None:
+        if RL not in self.params:
+            raise ConfigError(
+                f"{self.manifest.path}: no policy was kept there, an encoder alone; name a run that trains "
+                "RL or one of its checkpoints"
+            )
+
+    def _over(self, function: Callable[[Array], jax.Array], observations: Array) -> jax.Array:
+        """A function of a batch, of observations with any axes in front."""
+        if not isinstance(observations, jax.Array):
+            observations = np.array(observations)  # a copy, for jax may go on reading what it is handed
+        shape = self.encoder.observation_shape
+        if observations.shape[-3:] != shape or observations.dtype not in (np.uint8, np.float32):
+            wanted, given = ", ".join(map(str, shape)), list(observations.shape)
+            raise ValueError(
+                f"observations must be uint8, or float32 in [0, 1], [..., {wanted}], not "
+                f"{observations.dtype} {given}"
+            )
+        result = function(observations.reshape(-1, *shape))
+        return result.reshape(*observations.shape[:-3], *result.shape[1:])
+
+
+def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) -> Loaded:
+    """Loads what was trained.
+
+        policy = srl_jax.load("runs/pong")  # or "runs/pong/best", "runs/pong/checkpoints/000500000"
+        policy.encode(observations), policy.q_values(observations), policy.act(observations)
+        srl_jax.load("runs/pong/encoders/000100000").encode(observations)
+
+    Args:
+        path: a run directory, whose newest checkpoint is meant; one of its checkpoints; its best/; or an
+            encoder that was kept in its encoders/, which has no policy beside it.
+        imports: files and modules to import first, which register what the run is made of, as of `--import`;
+            None for those that its configuration names.
 
     Raises:
-        srl_jax.errors.ConfigError: there is none, it is damaged, does not fit this code, or it is an encoder
-            that was kept alone, see `load_encoder`.
+        srl_jax.errors.ConfigError: there is none, it is damaged, does not fit this code, or something cannot
+            be imported; one line.
     """
-    manifest = checkpoint.read_manifest(path)
-    agent, template = _agent_of(manifest)
-    tree = checkpoint.load(manifest)
-    if checkpoint.is_part(template, tree):
-        raise ConfigError(
-            f"{manifest.path}: a kept encoder, without a policy; name the run or one of its checkpoints "
-            "(srl_jax.loading.load_encoder and --encoder_from take kept encoders)"
-        )
-    return agent, checkpoint.load_into(template, tree, str(manifest.path)), manifest
-
-
-def load_encoder(path: str | Path) -> tuple[Encoder, Params, checkpoint.Manifest]:
-    """The encoder of a run, of one of its checkpoints, or one that was kept, `RUN/encoders/ENV_STEPS`.
-
-        encoder, params, manifest = load_encoder("runs/pong/encoders/000002000")
-        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S * C] -> float32 [B, D]
-
-    Raises:
-        srl_jax.errors.ConfigError: there is none, it is damaged, or does not fit this code.
-    """
-    manifest = checkpoint.read_manifest(path)
-    encoder = _agent_of(manifest)[0].encoder
-    template = jax.eval_shape(encoder.init, jax.random.key(0))
-    tree = checkpoint.load(manifest)["encoder"]
-    return encoder, checkpoint.load_into(template, tree, str(manifest.path)), manifest
-
-
-def _agent_of(manifest: checkpoint.Manifest) -> tuple[Agent, Any]:
-    """The agent of a checkpoint's configuration, and the shapes of its parameters."""
+    manifest = checkpoint.read_manifest(Path(path))
+    plugins.load(map(plugins.located, manifest.config.imports if imports is None else imports))
     try:
         agent = make_agent(manifest.config, manifest.frame_shape, manifest.num_actions)
-        return agent, agent.shapes().params
+        template = agent.shapes().params
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{manifest.path}: {error}") from None
+    tree = checkpoint.load(manifest)
+    # A kept encoder comes alone, or with the decoders that diagnostics keep.
+    template = {name: x for name, x in template.items() if name in tree}
+    params = checkpoint.load_into(template, tree, str(manifest.path))
+    return Loaded(agent, jax.tree.map(jnp.asarray, params), manifest)
 
 
-def greedy_policy(agent: Agent, params: Any, key: jax.Array) -> Policy:
+def greedy_policy(agent: Agent, params: dict[str, Params], key: jax.Array) -> Policy:
     """The epsilon-greedy policy of an agent's parameters, without noise, as a function of numpy arrays."""
 
     def policy(frames: np.ndarray, step: int, epsilon: float) -> np.ndarray:
@@ -78,14 +165,15 @@ def given_policy(
     """
     if not config.policy_from:
         return None
-    agent, params, manifest = load_agent(config.policy_from)
+    loaded = load(config.policy_from, imports=())  # what this run imports is imported already
+    manifest = loaded.manifest
     if manifest.num_actions != num_actions:
         raise ConfigError(
             f"--policy_from={config.policy_from}: its policy has {manifest.num_actions} actions, "
             f"{config.game} has {num_actions}"
         )
     checkpoint.check_frames(manifest, frame_shape, f"--policy_from={config.policy_from}", config.game)
-    return lambda key: greedy_policy(agent, params, key)
+    return loaded.policy
 
 
 def initial_params(config: Config, frame_shape: tuple, template: dict[str, Params]) -> dict[str, Params]:

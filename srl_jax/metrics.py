@@ -8,7 +8,6 @@ same machine therefore have equal rows once `strip_wall` has been applied.
 import hashlib
 import json
 import math
-import numbers
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -210,26 +209,21 @@ def _plain(key: str, value: Any) -> Any:
     """The value in Python's own types, floats finite or None."""
     if value is None or isinstance(value, str | bool):
         return value
-    if isinstance(value, numbers.Integral):
-        return int(value)
-    if isinstance(value, float) and not isinstance(value, np.generic):
-        return value if math.isfinite(value) else None
     if isinstance(value, list | tuple):
         return [_plain(key, item) for item in value]
     array = np.asarray(value)
     if array.ndim:
         return [_plain(key, item) for item in array]
-    if array.dtype == np.bool_:
-        return bool(array)
-    if np.issubdtype(array.dtype, np.integer):
-        return int(array)
-    if array.dtype == np.float64:
-        return _plain(key, float(array))
+    if array.dtype.kind in "biu":
+        return array.item()
+    if isinstance(value, int):  # larger than any array's
+        return value
     try:
         if array.dtype.kind == "c":
             raise TypeError
         # numpy prints the shortest decimal that gives back the same float32; the nearest double to
         # it prints the same. Narrower floats fit in a float32.
-        return _plain(key, float(str(array.astype(np.float32)[()])))
+        number = float(array if array.dtype == np.float64 else str(array.astype(np.float32)[()]))
+        return number if math.isfinite(number) else None
     except (TypeError, ValueError):
         raise TypeError(f"{key}: cannot write a value of type {type(value).__name__}") from None

@@ -1,19 +1,21 @@
-"""Files that somebody else may have written, read as data. Imports no jax."""
+"""Files and JSON that people, or other programs, may have written. Imports no jax."""
 
 import errno
 import json
 import os
 import stat
+import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 SETTINGS = 1 << 24
-"""Bytes that a config.json or a manifest may have."""
+"""Bytes that a config.json may have."""
 ROWS = 1 << 30
 """Bytes that a metrics.jsonl may have."""
 
 
-def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
+def read_bytes(path: str | os.PathLike, limit: int = sys.maxsize) -> bytes:
     """The content of a regular file. A pipe is not waited for, and no device is read.
 
     Args:
@@ -25,21 +27,29 @@ def read_bytes(path: str | os.PathLike, limit: int) -> bytes:
     """
     path = os.fspath(path)
     try:
-        mode = os.stat(path).st_mode
-        if stat.S_ISDIR(mode):
-            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), path)
-        if not stat.S_ISREG(mode):
-            raise OSError(errno.EINVAL, "Not a regular file", path)
-        with open(path, "rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            data = file.read(size + 1) if size <= limit else None
-    except MemoryError:
-        raise OSError(errno.ENOMEM, os.strerror(errno.ENOMEM), path) from None
+        about = os.stat(path)
     except ValueError as error:  # a NUL in the path
         raise OSError(errno.EINVAL, str(error), path) from None
-    if data is None or len(data) > limit:
+    if not stat.S_ISREG(about.st_mode):
+        code = errno.EISDIR if stat.S_ISDIR(about.st_mode) else errno.EINVAL
+        raise OSError(code, os.strerror(code) if code == errno.EISDIR else "Not a regular file", path)
+    if about.st_size > limit:
         raise OSError(errno.EFBIG, f"File larger than {limit} bytes", path)
-    return data
+    return Path(path).read_bytes()
+
+
+def replace_text(path: Path, text: str) -> None:
+    """Writes a file at once, flushed to disk: no process that is killed leaves half of it.
+
+    Raises:
+        OSError: it could not be written; it is as it was.
+    """
+    partial = path.with_name(f"{path.name}.partial")
+    with open(partial, "w", encoding="utf-8") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
+    os.replace(partial, path)
 
 
 def parse_json(data: bytes | str, constant: Callable[[str], Any] | None = None) -> Any:

@@ -122,11 +122,6 @@ class Replay:
         """Transitions that can be sampled now."""
         return self.num_sampleable
 
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all arrays, the tree included, whether filled yet or not."""
-        return sum(getattr(value, "nbytes", 0) for value in vars(self).values())
-
     def begin(self, frames: np.ndarray, streams: np.ndarray | None = None) -> None:
         """Stores the first frames of new episodes.
 
@@ -274,14 +269,9 @@ class Replay:
         They are for `restore`. A view shows later changes: write it, or copy it, before the next call. Frames
         come in chunks of `CHUNK_BYTES`, "frames_00000" and so on, of the slots that were ever written.
         """
-        arrays, numbers = self._bookkeeping()
-        return arrays | {name: self.frames[:, slots] for name, slots in self._chunks()}, numbers
-
-    def _bookkeeping(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        """All state but the frames."""
         arrays = {name: getattr(self, name) for name in _ARRAYS} | {"priorities": self.tree.leaves}
         numbers = {name: getattr(self, name) for name in _NUMBERS} | {"rng": self.rng.bit_generator.state}
-        return arrays, numbers
+        return arrays | {name: self.frames[:, slots] for name, slots in self._chunks()}, numbers
 
     def _chunks(self) -> list[tuple[str, slice]]:
         """Names and slots of the chunks of frames."""
@@ -297,9 +287,6 @@ class Replay:
 
         Args:
             since: int64 [N], a copy of `next_position` of that moment; zeros for the very start.
-
-        Raises:
-            ValueError: this replay was never there.
         """
         changed = self.changed_slots(since)
         return [name for name, slots in self._chunks() if not changed[slots].any()]
@@ -312,98 +299,34 @@ class Replay:
                 asked for once, so that arrays may be read from disk then.
 
         Raises:
-            ValueError: something is missing, has another shape or dtype, or contradicts the rest, in one
-                line; nothing is changed then, unless it is the frames.
+            ValueError: an array has another shape or dtype, in one line; the replay is of no use then.
         """
-        frames = {name for name in arrays if name.startswith("frames_")}
-        rng = self._check_snapshot({name: arrays[name] for name in arrays if name not in frames}, numbers)
+
+        def fitting(name, own):
+            if ((found := arrays[name]).shape, found.dtype) != (own.shape, own.dtype):
+                message = f"must be {own.dtype} {own.shape}, got {found.dtype} {found.shape}"
+                raise ValueError(f"replay snapshot: {name} {message}")
+            return found
+
         for name in _ARRAYS:
-            getattr(self, name)[...] = arrays[name]
+            own = getattr(self, name)
+            own[...] = fitting(name, own)
         for name in _NUMBERS:
             setattr(self, name, numbers[name])
-        self.tree.fill(arrays["priorities"])
-        self.rng = rng
-        if frames != {name for name, _ in self._chunks()}:
-            raise ValueError(
-                f"replay snapshot: chunks of frames must be {', '.join(n for n, _ in self._chunks())}"
-            )
+        self.tree.fill(fitting("priorities", self.tree.leaves))
+        self.rng.bit_generator.state = numbers["rng"]
         for name, slots in self._chunks():
-            chunk, own = arrays[name], self.frames[:, slots]
-            if (chunk.shape, chunk.dtype) != (own.shape, own.dtype):
-                raise ValueError(f"replay snapshot: {name} must be {own.dtype} {own.shape}")
-            own[:] = chunk
+            own = self.frames[:, slots]
+            own[:] = fitting(name, own)
 
     def changed_slots(self, since: np.ndarray) -> np.ndarray:
         """Which slots, bool [L], had a frame written in any stream since an earlier moment.
 
         Args:
             since: int64 [N], a copy of `next_position` of that moment; zeros for the very start.
-
-        Raises:
-            ValueError: this replay was never there.
         """
-        since = _check("since", since, self.next_position.shape, np.int64)
-        if (since < 0).any() or (since > self.next_position).any():
-            raise ValueError(f"since must lie in [0, {self.next_position.tolist()}], got {since.tolist()}")
         laps_behind = (np.arange(self.slots) - since[:, None]) % self.slots
         return (laps_behind < (self.next_position - since)[:, None]).any(axis=0)
-
-    def _check_snapshot(self, arrays, numbers):
-        """The generator of a snapshot, if everything in it is a state that a replay like this can be in."""
-        own_arrays, own_numbers = self._bookkeeping()
-        for what, given, own in (("arrays", arrays, own_arrays), ("numbers", numbers, own_numbers)):
-            if not isinstance(given, Mapping) or given.keys() != own.keys():
-                raise ValueError(f"replay snapshot: the {what} must be {', '.join(own)}")
-        for name, own in own_arrays.items():
-            array = arrays[name]
-            if not isinstance(array, np.ndarray) or (array.shape, array.dtype) != (own.shape, own.dtype):
-                raise ValueError(f"replay snapshot: {name} must be {own.dtype} {own.shape}")
-        for name in _NUMBERS:
-            if type(numbers[name]) is not type(own_numbers[name]):
-                raise ValueError(f"replay snapshot: {name} must be a {type(own_numbers[name]).__name__}")
-        rng = np.random.default_rng(0)
-        try:
-            rng.bit_generator.state = numbers["rng"]
-            known_rng = rng.bit_generator.state == numbers["rng"]
-        except Exception:  # numpy's checks raise many kinds
-            known_rng = False
-
-        stored, start, active = arrays["next_position"], arrays["episode_start"], arrays["active"]
-        newest = stored[:, None] - 1
-        positions = newest - (newest - np.arange(self.slots)) % self.slots
-        intact = positions >= np.maximum(newest - self.slots + self.stack, 0)
-        known = positions <= newest - np.where(active, self.horizon, 1)[:, None]
-        of_newest_episode = positions >= start[:, None]
-        priorities, most = arrays["priorities"], numbers["max_priority"]
-        can = priorities.reshape(positions.shape) > 0
-        most_steps = max(int(stored.min()) - 1, 0)
-        for holds, message in (
-            (known_rng, f"rng must be a state of {own_numbers['rng']['bit_generator']}"),
-            ((arrays["flags"] <= _ENDED | _TERMINAL).all(), "flags has unknown bits"),
-            ((arrays["age"] < self.stack).all(), f"age must be below {self.stack}"),
-            # Far below 2 ** 63, so that no position or index to come overflows.
-            (((stored >= 0) & (stored < 2**48)).all(), "next_position is out of range"),
-            (not active[stored == 0].any(), "active before anything is stored"),
-            # An episode that is over has two observations.
-            (
-                ((start >= 0) & (start <= np.maximum(stored - 2 + active, 0))).all(),
-                "episode_start is out of range",
-            ),
-            (
-                numbers["num_transitions"] in range(0, self.num_streams * most_steps + 1, self.num_streams),
-                "num_transitions is out of range",
-            ),
-            (1 <= most and most * priorities.size < np.inf, "max_priority is out of range"),
-            (((priorities >= 0) & (priorities <= most)).all(), "priorities must lie in [0, max_priority]"),
-            (numbers["num_sampleable"] == np.count_nonzero(can), "num_sampleable is not that of priorities"),
-            (
-                (can <= intact).all() and (can == (intact & known))[of_newest_episode].all(),
-                "priorities are not those of transitions that can be sampled",
-            ),
-        ):
-            if not holds:
-                raise ValueError(f"replay snapshot: {message}")
-        return rng
 
     def _flat(self, array):
         """A view of [N, L, ...] as [N * L, ...], so that leaves index it."""

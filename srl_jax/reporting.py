@@ -1,5 +1,6 @@
 """Reports of a run: rows of metrics.jsonl, the progress bar, and the means between two rows."""
 
+import contextlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from srl_jax.display import Display
-from srl_jax.errors import SaveError
+from srl_jax.errors import saving
 from srl_jax.evaluate import Evaluation
 from srl_jax.metrics import Mark, MetricsWriter
 from srl_jax.progress import Progress
@@ -49,15 +50,8 @@ class Means:
         return {name: [total.hex(), count] for name, (total, count) in self._sums.items()}
 
     def restore(self, snapshot: Mapping[str, Any]) -> None:
-        """Goes on from there.
-
-        Raises:
-            ValueError, TypeError, AttributeError, OverflowError: it is not what `snapshot` gave.
-        """
-        sums = {name: (float.fromhex(total), _count(count)) for name, (total, count) in snapshot.items()}
-        if not all(count for _, count in sums.values()):
-            raise ValueError("a mean of nothing")
-        self._sums = sums
+        """Goes on from there."""
+        self._sums = {name: (float.fromhex(total), count) for name, (total, count) in snapshot.items()}
 
 
 class Report:
@@ -88,11 +82,9 @@ class Report:
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: Any) -> None:
         self.progress.__exit__(kind, error, trace)
-        try:
+        # After an error a row was not written, or worse, and the caller is told that.
+        with saving(self.path, "not closed") if error is None else contextlib.suppress(OSError):
             self._writer.close()
-        except OSError as problem:
-            if error is None:  # else a row was not written, or worse, and whoever called us is told
-                raise SaveError(f"{self.path}: not closed: {problem.strerror}") from problem
 
     @property
     def seconds(self) -> float:
@@ -146,17 +138,13 @@ class Report:
         return mean
 
     def _write(self, kind: str, env_steps: int, updates: int, seconds: float, values: Mapping) -> None:
-        try:
+        with saving(self.path, "a row was not written"):
             self._writer.write(kind, env_steps, updates, seconds, values)
-        except OSError as error:
-            raise SaveError(f"{self.path}: a row was not written: {error.strerror}") from error
 
     def snapshot(self) -> dict[str, Any]:
         """As JSON values; rows written so far are flushed to disk."""
-        try:
+        with saving(self.path, "not flushed"):
             mark = self._writer.mark()
-        except OSError as error:
-            raise SaveError(f"{self.path}: not flushed: {error.strerror}") from error
         return {
             "metrics": mark._asdict(),
             "seconds": self.seconds,
@@ -171,33 +159,9 @@ class Report:
         Args:
             snapshot: from `snapshot`, by way of JSON.
             env_steps: when it was taken.
-
-        Raises:
-            KeyError, ValueError, TypeError, AttributeError, OverflowError: it is not what `snapshot` gave.
         """
-        mark = Mark(**snapshot["metrics"])
-        if type(mark.sha256) is not str:
-            raise TypeError("not a sum")
-        self._mark, self._begun = mark._replace(bytes=_count(mark.bytes)), env_steps
-        self._started = time.perf_counter() - _number(snapshot["seconds"])
-        wall, steps = snapshot["last_row"]
-        self._last_row = _number(wall), _count(steps)
-        if steps > env_steps:
-            raise ValueError("the last row is of later")
-        total, count = snapshot["returns"]
-        self._return_sum, self._episodes = _number(total), _count(count)
+        self._mark, self._begun = Mark(**snapshot["metrics"]), env_steps
+        self._started = time.perf_counter() - snapshot["seconds"]
+        self._last_row = tuple(snapshot["last_row"])
+        self._return_sum, self._episodes = snapshot["returns"]
         self.means.restore(snapshot["means"])
-
-
-def _number(value: Any) -> float:
-    if type(value) not in (int, float):
-        raise TypeError(f"not a number: {value!r:.50}")
-    return float(value)
-
-
-def _count(value: Any) -> int:
-    if type(value) is not int:
-        raise TypeError(f"not a count: {value!r:.50}")
-    if not 0 <= value < 2**63:
-        raise ValueError(f"out of range: {value}")
-    return value

@@ -1,4 +1,4 @@
-"""Locks of run directories: each directory has one writer at a time."""
+"""Run directories: how one is made, and the lock that gives it one writer at a time."""
 
 import contextlib
 import fcntl
@@ -6,12 +6,14 @@ import functools
 import json
 import os
 import platform
+import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
 
 from srl_jax import display
-from srl_jax.errors import ConfigError
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError, SaveError
 
 LOCK = "lock"
 
@@ -73,6 +75,49 @@ def held(run: Path) -> Iterator[None]:
         with contextlib.suppress(OSError):
             path.unlink()
         os.close(descriptor)
+
+
+@contextlib.contextmanager
+def run_directory(path: Path, config: Config) -> Iterator[None]:
+    """Makes the run directory with its config.json; unmakes it if what follows refuses the config.
+
+    Args:
+        path: of a directory that may be made, or may be emptied: a run that lies there is deleted.
+        config: resolved; written to config.json.
+
+    Raises:
+        ConfigError: it cannot be made, or another process writes there.
+        SaveError: config.json could not be written.
+    """
+    made, written = [], False
+    try:
+        try:
+            missing = [p for p in (path, *path.absolute().parents) if not p.exists()]
+            for directory in reversed(missing):
+                directory.mkdir()
+                made.append(directory)
+        except OSError as error:
+            raise ConfigError(f"--out={path}: {error.strerror}") from None
+        with held(path):
+            try:
+                for old in path.iterdir():
+                    # The old config.json stays until the new one replaces it: it says that this is a run.
+                    if old.name not in (LOCK, "config.json"):
+                        shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
+                config.save(path)
+                written = True
+            except OSError as error:
+                raise SaveError(f"--out={path}: {error.strerror}") from None
+            yield
+    except ConfigError:
+        # Only what was made here goes: once anything else lies there, all of it stays.
+        with contextlib.suppress(OSError):
+            if written and [file.name for file in path.iterdir()] == ["config.json"]:
+                (path / "config.json").unlink()
+        with contextlib.suppress(OSError):
+            for directory in reversed(made):
+                directory.rmdir()
+        raise
 
 
 def _lock(descriptor: int, how: int) -> str:

@@ -269,8 +269,8 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
     for key, value in texts.items():
         if key not in defaults:
             known = ", ".join(f"{k}={value_text(v)}" for k, v in defaults.items()) or "none"
-            near = difflib.get_close_matches(key, defaults, n=1, cutoff=0.6)
-            suggestion = f"did you mean {near[0]}? " if near else ""
+            close = near(key, defaults, most=1)
+            suggestion = f"did you mean {close[0]}? " if close else ""
             raise SpecError(
                 f"{where}: {name} has no option {key!r}; {suggestion}options and defaults: {known}"
             )

@@ -16,7 +16,7 @@ class SumTree:
 
     Attributes:
         capacity: int, how many leaves there are.
-        leaves: float64 [capacity], the values; read only: write through `set`. It is the whole
+        leaves: float64 [capacity], the values; read only: write through `put`. It is the whole
             state: the inner nodes follow from it.
     """
 
@@ -25,12 +25,7 @@ class SumTree:
 
         Args:
             capacity: the number of leaves, at least 1.
-
-        Raises:
-            ValueError: capacity is below 1.
         """
-        if capacity < 1:
-            raise ValueError(f"capacity must be at least 1, got {capacity}")
         self.capacity = int(capacity)
         blocks = -(-self.capacity // _BLOCK)
         self._blocks, self._sums = np.zeros((blocks, _BLOCK)), np.zeros(blocks)
@@ -39,73 +34,34 @@ class SumTree:
 
     @property
     def total(self) -> float:
-        """The sum of all leaves, rounded as by one summation, however many `set`s there were."""
+        """The sum of all leaves, rounded as by one summation, however many `put`s there were."""
         return float(self._sums.sum())
-
-    @property
-    def nbytes(self) -> int:
-        """Bytes of all nodes: 8 * 65 / 64 a leaf, and the padding to whole blocks."""
-        return self._blocks.nbytes + self._sums.nbytes
 
     def get(self, indices: np.ndarray) -> np.ndarray:
         """The values, float64 [n], of the leaves `indices`, int [n] in [0, capacity)."""
         return self.leaves[indices]
 
-    def set(self, indices: np.ndarray, values: np.ndarray) -> None:
-        """Writes leaves and every sum above them.
+    def put(self, indices: np.ndarray, values: np.ndarray) -> None:
+        """Writes leaves and the sums of their blocks.
 
-        Sums are computed anew from the children, never by a difference: errors do not build up.
+        Sums are computed anew from the leaves, never by a difference: errors do not build up.
 
         Args:
-            indices: int [n] in [0, capacity). Where an index is repeated, its last value counts.
-            values: float [n] (or one number for all), finite and not negative.
-
-        Raises:
-            IndexError: an index is out of range.
-            ValueError: a value is negative or not finite.
+            indices: int64 [n] in [0, capacity). Where an index is repeated, its last value counts.
+            values: float64 [n] (or one number for all), finite and not negative. None of it is checked.
         """
-        indices = np.asarray(indices, np.int64)
-        values = np.asarray(values, np.float64)
-        if not indices.size:
-            return
-        if indices.min() < 0 or indices.max() >= self.capacity:
-            raise IndexError(f"leaf index out of range for a capacity of {self.capacity}")
-        if not (values.min() >= 0 and values.max() < np.inf):
-            raise ValueError("values must be finite and not negative")
-        self.put(indices, values)
-
-    def put(self, indices: np.ndarray, values: np.ndarray) -> None:
-        """As `set`, without its checks: for int64 indices and float64 values that are known to be right."""
         self._blocks.reshape(-1)[indices] = values
         blocks = indices >> _SHIFT
         self._sums[blocks] = np.add.reduce(self._blocks.take(blocks, axis=0), axis=1)
 
     def fill(self, values: np.ndarray) -> None:
-        """Writes all leaves; every sum comes out to the bit as if they had been `set` one by one.
+        """Writes all leaves; every sum comes out to the bit as if they had been `put` one by one.
 
         Args:
             values: float64 [capacity], finite and not negative, which is not checked.
         """
         self._blocks.reshape(-1)[: self.capacity] = values
         np.add.reduce(self._blocks, axis=1, out=self._sums)
-
-    def find(self, prefix_sums: np.ndarray) -> np.ndarray:
-        """The leaf in which each prefix sum falls: leaf i covers [sum before i, sum up to i).
-
-        Args:
-            prefix_sums: float [n] in [0, total]. One that rounding puts at or past the end of its
-                subtree gets the last leaf there that is not negligible.
-
-        Returns:
-            int64 [n]; never a leaf whose value is 0.
-
-        Raises:
-            ValueError: all leaves are 0, or a prefix sum is negative.
-        """
-        prefix_sums = np.asarray(prefix_sums, np.float64)
-        if prefix_sums.size and not prefix_sums.min() >= 0:
-            raise ValueError("prefix sums must not be negative")
-        return self._find(prefix_sums, self._ends())
 
     def _ends(self):
         """float64 [blocks + 1]: 0, and the sums up to the end of each block."""
@@ -117,6 +73,11 @@ class SumTree:
         return ends
 
     def _find(self, prefix_sums, ends):
+        """The leaf, int64 [n], in which each prefix sum falls: leaf i covers [sum before i, sum up to i).
+
+        `ends` is `_ends()`. A prefix sum that rounding puts at or past the end of its block gets the last
+        leaf there that is not negligible; none gets a leaf whose value is 0.
+        """
         # Strictly below the last end, so that an end above exists; the first such end is above the one
         # before it, too, so its block is not 0. Likewise for the leaf within the block.
         rest = np.minimum(prefix_sums, np.nextafter(ends[-1], 0.0))

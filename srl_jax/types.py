@@ -155,12 +155,12 @@ class Objective(NamedTuple):
     """
 
     init: Callable[[jax.Array], Params]
-    loss: Callable[[Params, Params, Latents, Window, jax.Array], tuple[jax.Array, Mapping[str, jax.Array]]]
+    loss: Callable[[Params, Params, Latents, Window, jax.Array], tuple[Array, Mapping[str, Array]]]
     weight: float = 1.0
     horizon: int = 0
     slow: Callable[[Params, Params, Array], Params] | None = None
     is_decoder: bool = False
-    image: Callable[[Params, Latents, Window], tuple[jax.Array, jax.Array]] | None = None
+    image: Callable[[Params, Latents, Window], tuple[Array, Array]] | None = None
 
 
 class TrainState(NamedTuple):

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 from srl_jax.types import Array, Window
 
 
-def observation(window: Window, k: int | Array) -> Array:
+def observation(window: Window, k: int | Array) -> jax.Array:
     """The stack of frames s_{t+k}, newest last: uint8 [B, H, W, S * C].
 
     Args:
@@ -32,7 +32,7 @@ def to_unit(pixels: Array) -> Array:
     return pixels.astype(jnp.float32) / 255.0 if pixels.dtype == jnp.uint8 else pixels
 
 
-def stack_last(frames: Array) -> Array:
+def stack_last(frames: Array) -> jax.Array:
     """[B, S, H, W, C], as replay and the actor keep it, -> [B, H, W, S * C], as networks read it."""
     batch, stack, height, width, channels = frames.shape
     planes = jnp.moveaxis(frames, -1, 2).reshape(batch, stack * channels, height, width)

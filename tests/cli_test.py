@@ -182,7 +182,7 @@ BAD = [
     (["--rl=rainbow:n_stp=3"], "--rl=rainbow:n_stp=3", "did you mean n_step?"),
     (["--rl=rainbow:v_min=20"], "--rl=rainbow", "v_max"),
     (["--rl=rainbow:distributional=false,v_min=-1"], "--rl=rainbow", "nothing reads v_min"),
-    (["--rl=dqn", "--num_atoms=21"], "--rl=dqn:atoms=21", "dqn has no option 'atoms'"),
+    (["--rl=dqn:atoms=21"], "--rl=dqn:atoms=21", "dqn has no option 'atoms'"),
     (["--encoder=natur"], "--encoder=natur", "did you mean nature?"),
     (["--encoder=nature", "--frame_size=10", "--game=Pong"], "--encoder=nature", "10"),
     (["--mode=joint", "--objective=recon"], "--objective=recon", "valid: reconstruction"),

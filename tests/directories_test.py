@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from experiments import directories
-from experiments.directories import all_to_resume, check_out, going_on, run_directory, to_resume
+from experiments.directories import all_to_resume, check_out, going_on, to_resume
 from srl_jax import checkpoint, ending, rundir
 from srl_jax import config as config_module
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.rundir import run_directory
 from tests.helpers import NOT_FINITE, write_run
 from tests.rundir_test import contents
 

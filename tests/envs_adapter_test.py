@@ -215,23 +215,6 @@ def test_an_environment_that_is_not_deterministic_is_not_resumed():
         again.step(np.zeros(2, int))
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "message"),
-    [
-        ("actions", np.array([0, 2], np.int32), r"actions of the snapshot must be at most 1"),
-        ("actions", np.array([0], np.int32), r"action_counts of the snapshot add up to 2, actions are 1"),
-        ("episodes", np.array([0, 1]), r"episodes of the snapshot must be at least 1"),
-        ("episodes", np.array([1, 9]), r"environments \[1\] cannot be rebuilt"),
-    ],
-)
-def test_a_snapshot_that_is_damaged(name, value, message):
-    env = make(seed=2)
-    env.reset()
-    env.step(np.array([0, 1]))
-    with pytest.raises(ValueError, match=message):
-        make(seed=2).restore({**env.snapshot(), name: value})
-
-
 def broken(self):
     raise KeyError("a\nb")
 

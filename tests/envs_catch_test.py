@@ -285,7 +285,7 @@ def test_balls_of_other_sizes(ball):
     # where its size is even; and at 42 x 42 the mean of 2 x 2 pixels.
     actions = np.random.default_rng(0).integers(0, 3, (40, 8))
     large = record(envs.make(f"catch:ball={ball}", num_envs=8, seed=3), actions)
-    frames = np.concatenate([x for x in large if x.ndim == 3]).astype(float)
+    frames = np.concatenate([x[..., 0] for x in large if x.ndim == 4]).astype(float)
     states = np.concatenate([x for x in large if x.shape == (8, 5)])
     above = frames[:, :76]
     assert (above > 0).sum((1, 2)).tolist() == [ball**2] * len(frames)
@@ -293,7 +293,7 @@ def test_balls_of_other_sizes(ball):
     np.testing.assert_allclose(above.sum(1) @ index / mass, states[:, 0] + shift)
     np.testing.assert_allclose(above.sum(2) @ index[:76] / mass, states[:, 1] + shift)
     small = record(envs.make(f"catch:ball={ball}", num_envs=8, seed=3, frame_size=42), actions)
-    means = [x.reshape(8, 42, 2, 42, 2).mean((2, 4)) if x.ndim == 3 else x for x in large]
+    means = [x.reshape(8, 42, 2, 42, 2, 1).mean((2, 4)) if x.ndim == 4 else x for x in large]
     assert same(means, small)
 
 

@@ -1,20 +1,45 @@
 """The examples do what they say."""
 
+import pathlib
+import re
+import shlex
+
 import gymnasium
+import jax
 import numpy as np
 import pytest
 from absl import flags
 from gymnasium.utils.env_checker import check_env
 
+from examples import foreign_loop, own_objective, use_an_encoder
 from examples.own_environment import Dot
 from experiments import flags as config_flags
 from experiments import train
 from srl_jax import envs
 from srl_jax.config import Config
-from srl_jax.diagnostics import heldout
+from srl_jax.diagnostics import heldout, measure
 from srl_jax.metrics import read_metrics
+from srl_jax.types import Latents
+from tests.helpers import make_context, make_window
 
 GAME = "examples.own_environment:Dot-v0"
+SMALL = {"steps": 240, "eval_every": 120, "log_every": 40, "eval_games": 2, "eval_max_steps": 100}
+SMALL |= {"buffer_size": 400, "learn_start": 40, "num_envs": 4, "batch_size": 8, "frame_size": 42}
+SMALL |= {"rl": "rainbow:hidden=16,atoms=11", "encoder": "tiny:features=8"}
+
+
+@pytest.fixture
+def few_held_out(monkeypatch):
+    monkeypatch.setattr(heldout, "WINDOWS", 64)
+    monkeypatch.setattr(measure, "DECODED", 64)
+
+
+def trained(*arguments):
+    """Trains a small run as the command line does."""
+    values = flags.FlagValues()
+    train.define_flags(values)
+    config_flags.parse(["train", *arguments, *(f"--{name}={value}" for name, value in SMALL.items())], values)
+    assert train.train(values) == 0
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")  # what gymnasium's checker recommends
@@ -23,8 +48,7 @@ def test_the_environment_keeps_gymnasiums_promises():
     envs.game(GAME).check()
 
 
-def test_its_state_is_what_is_seen(monkeypatch):
-    monkeypatch.setattr(heldout, "WINDOWS", 64)
+def test_its_state_is_what_is_seen(few_held_out):
     held_out = heldout.collect(Config(game=f"{GAME},grey=true", frame_size=64), 1)
     assert held_out.variables == Dot.state_names and not held_out.problem
     # Green is of brightness 150, red of 76; the dot is drawn over the place.
@@ -35,21 +59,54 @@ def test_its_state_is_what_is_seen(monkeypatch):
         assert (frame > 0).sum() == len({dot, place})
 
 
-@pytest.mark.parametrize("options", ["", ",grey=true"])
-def test_an_environment_of_ones_own_is_trained(options, tmp_path, monkeypatch):
-    monkeypatch.setattr(heldout, "WINDOWS", 64)
-    small = {"steps": 240, "eval_every": 120, "log_every": 40, "eval_games": 2, "eval_max_steps": 100}
-    small |= {"buffer_size": 400, "learn_start": 40, "num_envs": 4, "batch_size": 8, "frame_size": 42}
-    small |= {"rl": "rainbow:hidden=16,atoms=11", "encoder": "tiny:features=8", "out": tmp_path / "run"}
-    small |= {"mode": "joint", "objective": "reconstruction"}
-    values = flags.FlagValues()
-    train.define_flags(values)
-    arguments = [f"--{name}={value}" for name, value in small.items()]
-    config_flags.parse(["train", f"--game={GAME}{options}", *arguments], values)
-    assert train.train(values) == 0
+@pytest.mark.parametrize("options", [",grey=true", ""])
+def test_an_environment_of_ones_own_is_trained(options, tmp_path, few_held_out):
+    trained(
+        f"--game={GAME}{options}", "--mode=joint", "--objective=reconstruction", f"--out={tmp_path / 'run'}"
+    )
     config = Config.load(tmp_path / "run")
     assert config.game == envs.canonical(f"{GAME}{options}")
     last = [row for row in read_metrics(tmp_path / "run/metrics.jsonl") if row["kind"] == "eval"][-1]
     assert last["env_steps"] == 240 and np.isfinite(last["eval/return_mean"])
     assert {f"diag/probe/{name}" for name in Dot.state_names} <= set(last)
     assert list((tmp_path / "run/figures").glob("*.png"))
+
+
+def test_an_own_objective_is_trained_as_it_says_and_its_encoder_is_used_elsewhere(tmp_path, few_held_out):
+    command, path = own_objective.__doc__.split("\n\n")[1].replace("\\\n", " "), tmp_path / "run"
+    program, name, *arguments = shlex.split(command)
+    assert (program, name, arguments.pop()) == ("srl-jax", "train", "--out=runs/slow")
+    trained(*arguments, f"--out={path}")
+    assert "slowness:weight=0.01" in Config.load(path).objectives
+    rows = read_metrics(path / "metrics.jsonl")
+    last = {kind: [row for row in rows if row["kind"] == kind][-1] for kind in ("train", "eval")}
+    assert last["train"]["loss/slowness"] > 0 and "diag/gradient/slowness/cosine" in last["eval"]
+    # Its own line imports what the run is made of, and the head learns over an encoder that stays as it is.
+    before, after = use_an_encoder.main(str(path), updates=30)
+    assert 0 < after < 0.7 * before
+
+
+def test_slowness_is_the_squared_step_of_the_latent_within_an_episode():
+    window = make_window(batch=3)._replace(valid=np.float32([[1, 1, 1], [0, 0, 0], [1, 0, 0]]))
+    z = np.float32([[[0, 0], [1, 1], [2, 0]], [[3, 4], [5, 5], [2, 0]]])  # offsets 0 and 1
+    objective = own_objective.slowness(make_context())
+    latents = Latents(lambda k: z[k], None)
+    losses, metrics = objective.loss({}, {}, latents, window, None)
+    assert losses.tolist() == [25.0, 0.0, 0.0] and metrics == {}
+
+
+def test_the_foreign_loop_plays_and_learns_with_one_import():
+    returns = foreign_loop.main(400)
+    assert len(returns) >= 8 and set(returns) == {-1.0, 1.0}
+    keys = jax.random.split(jax.random.key(0), 3)
+    params = {"encoder": foreign_loop.encoder.init(keys[0]), "inverse": foreign_loop.inverse.init(keys[1])}
+    params["head"] = 0.1 * jax.random.normal(keys[2], (64, 3 * 31))
+    slow, opt_state, errors = params, foreign_loop.optimizer.init(params), []
+    for _ in range(30):
+        params, opt_state, td_error = foreign_loop.learn(
+            params, slow, opt_state, make_window(batch=64, size=42)
+        )
+        errors.append(float(td_error.mean()))
+    assert errors[-1] < errors[0] - 0.2
+    text = pathlib.Path(foreign_loop.__file__).read_text(encoding="utf-8")
+    assert len(re.findall("^ *(?:from|import) srl_jax", text, re.MULTILINE)) == 1

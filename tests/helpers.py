@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax import ending
+from srl_jax import checkpoint, ending
+from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.ending import Ending
 from srl_jax.types import Context, Decoder, Encoder, TrainState, Window
@@ -199,3 +201,23 @@ def write_run(
     if ended is not None:
         ending.write(path, ended)
     return path
+
+
+def write_checkpoint(
+    run: Path, *, env_steps: int = 240, folder: str = "checkpoints", only: Sequence[str] = (), **values
+) -> Path:
+    """A checkpoint of random parameters of an agent on Catch, less the run around it.
+
+    Args:
+        run: its directory.
+        env_steps: when it was written; also the seed of the parameters.
+        folder: of the run, where it goes.
+        only: groups of parameters that are kept; empty for all.
+        **values: fields of its Config, in place of `SMALL`'s.
+    """
+    config = Config(**{**SMALL, **values})
+    frame = (config.frame_size, config.frame_size, 1)
+    params = fill(make_agent(config, frame, NUM_ACTIONS).shapes().params, env_steps)
+    kept = {name: params[name] for name in only or params}
+    counts = {"num_actions": NUM_ACTIONS, "env_steps": env_steps, "updates": 1}
+    return checkpoint.save(run, kept, config, frame_shape=frame, folder=folder, **counts).path

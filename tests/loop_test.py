@@ -8,18 +8,20 @@ import re
 import shutil
 import threading
 import time
-from types import SimpleNamespace
 
 import jax
 import numpy as np
 import pytest
+from absl import flags
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
+from experiments import flags as config_flags
 from srl_jax import actor, checkpoint, ending, loading, loop
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
+from srl_jax.diagnostics.pictures import PICTURES
 from srl_jax.envs.catch import Catch
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
@@ -198,10 +200,10 @@ def test_the_last_evaluation_was_recorded(joint):
 
 def test_an_agent_comes_back_from_its_checkpoint(joint):
     path, _ = joint
-    agent, params, manifest = loading.load_agent(path)
-    assert (manifest.env_steps, manifest.updates) == (240, 25)
-    assert set(params) == {"encoder", "rl", "reconstruction", "latent_l2"}
-    assert set(agent.objectives) == {"rl", "reconstruction", "latent_l2"}
+    loaded = loading.load(path)
+    assert (loaded.env_steps, loaded.manifest.updates) == (240, 25)
+    assert set(loaded.params) == {"encoder", "rl", "reconstruction", "latent_l2"}
+    assert set(loaded.agent.objectives) == {"rl", "reconstruction", "latent_l2"}
 
 
 @pytest.mark.parametrize("mode", ["frozen", "finetuned", "joint", "decoupled"])
@@ -265,8 +267,10 @@ def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypa
         return make(*arguments, **options)
 
     monkeypatch.setattr(actor, "make_env", make_env)
-    given = {"run": str(joint[0]), "games": 1, "seed": 0, "epsilon": None, "gif": "", "tune_runtime": "off"}
-    monkeypatch.setattr(evaluate, "FLAGS", SimpleNamespace(**given))
+    values = flags.FlagValues()
+    evaluate.define_flags(values)
+    config_flags.parse(["evaluate", f"--run={joint[0]}", "--games=1"], values)
+    monkeypatch.setattr(evaluate, "FLAGS", values)
     evaluate.main([])
     assert asked == [(("eval", 1), {"seed": 0})]
     assert len(json.loads(capsys.readouterr().out)["returns"]) == 1
@@ -280,7 +284,7 @@ def test_a_checkpoint_that_asks_for_what_there_is_not_is_refused_by_its_name(joi
     for change, reason in (({"rl": "x"}, "no 'x'"), ({"encoder": "sac_ae:features=0"}, "features must be")):
         checkpoint.sign(manifest.parent, {**values, "config": {**values["config"], **change}})
         with pytest.raises(ConfigError, match=f"^{re.escape(str(manifest.parent))}.*{reason}"):
-            loading.load_agent(tmp_path / "copy")
+            loading.load(tmp_path / "copy")
 
 
 def test_an_encoder_that_does_not_fit_is_refused(joint):
@@ -464,16 +468,16 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
     np.testing.assert_array_equal(result.recording[..., 0], 255 - result.recording[..., 2])
     for name in ("reconstruction", "forward_pixels"):
         inputs, targets, outputs = result.pictures[name]
-        assert inputs.shape == targets.shape == outputs.shape == (loop.PICTURES, 42, 50, 3)
+        assert inputs.shape == targets.shape == outputs.shape == (PICTURES, 42, 50, 3)
         np.testing.assert_allclose(targets[..., 0], 1 - targets[..., 2], atol=1e-6)
         assert rows[0][-1][f"diag/error/{name}/moving"] > 0
     # No environment is needed to know it.
-    loaded, _, manifest = loop.load_agent(path)
-    assert manifest.frame_shape == (42, 50, 3) and loaded.encoder.observation_shape == (42, 50, 12)
+    loaded = loading.load(path)
+    assert loaded.manifest.frame_shape == (42, 50, 3) and loaded.encoder.observation_shape == (42, 50, 12)
     for flag in ("policy_from", "encoder_from"):
         grey = Config(**{**SMALL, "mode": "pretrain", "objectives": ("latent_l2",), flag: str(path)})
         with pytest.raises(ConfigError, match=rf"--{flag}=.* of \[42, 50, 3\], Catch shows \[42, 42, 1\]"):
-            loop.Run(grey, tmp_path, progress=False)
+            one_run(grey, tmp_path)
 
 
 def test_early_stop(tmp_path):
@@ -482,29 +486,6 @@ def test_early_stop(tmp_path):
     assert result.env_steps == 40 and ending.read(tmp_path / "run") == ("finished", 40, "")
     assert checkpoint.read_manifest(tmp_path / "run").env_steps == 40
     assert [row["kind"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl")] == ["eval"]
-
-
-def test_the_encoder_of_a_run_of_a_checkpoint_and_one_that_was_kept(joint):
-    path, _ = joint
-    agent, params, _ = loading.load_agent(path)
-    observations = np.random.default_rng(0).integers(0, 256, (2, 42, 42, 4), dtype=np.uint8)
-    newest = whole(path).path
-    for place in (path, path / "checkpoints", newest):
-        encoder, mine, manifest = loading.load_encoder(place)
-        assert manifest.path == newest and identical(mine, params["encoder"])
-    latents = encoder.apply(mine, observations)
-    assert latents.shape == (2, 8) and identical(
-        latents, agent.encoder.apply(params["encoder"], observations)
-    )
-    kept = path / "encoders" / "000000000"
-    encoder, first, manifest = loading.load_encoder(kept)
-    assert manifest.env_steps == 0 and not identical(encoder.apply(first, observations), latents)
-    # There is no policy to play with in it, wherever it lies.
-    for place in (kept, shutil.copytree(kept, path.parent / "elsewhere")):
-        with pytest.raises(ConfigError, match=f"^{place}: a kept encoder, without a policy; name the run or"):
-            loading.load_agent(place)
-    with pytest.raises(ConfigError, match="no checkpoint there"):
-        loading.load_encoder(path / "figures")
 
 
 def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):

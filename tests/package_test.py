@@ -78,6 +78,24 @@ def test_the_wheel_has_one_top_level_name_and_everything_that_runs(tmp_path):
     assert (done.returncode, done.stderr[:19]) == (2, "error: --game=Pogn:")
 
 
+def test_the_library_is_one_import_and_costs_nothing_until_it_is_used():
+    code = """if True:
+        import sys
+        import srl_jax
+        light = "jax" not in sys.modules and "numpy" not in sys.modules
+        config = srl_jax.Config(game="Catch")
+        light = light and "jax" not in sys.modules
+        from srl_jax import *
+        from srl_jax.replay import Replay as replay
+        from srl_jax.rl import losses as rl_losses
+        same = Replay is replay and losses is rl_losses and "inverse" in objectives.REGISTRY
+        sys.exit(not (light and same and callable(load) and dir(srl_jax) == srl_jax.__all__))
+    """
+    assert subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, timeout=120).returncode == 0
+    with pytest.raises(AttributeError, match="module 'srl_jax' has no attribute 'lodd'"):
+        srl_jax.lodd  # noqa: B018
+
+
 def _command(*arguments, cwd=ROOT, env=None):
     return subprocess.run(
         [sys.executable, "-m", "srl_jax", *arguments],

@@ -120,133 +120,18 @@ def step_of_one():
     return (np.zeros(1, int), np.zeros(1), *np.zeros((3, 1), bool), np.zeros((1, 2, 1, 2), np.uint8))
 
 
-def wrong(name, index, value):
-    """A change of one element of an array of a snapshot."""
-
-    def change(arrays, numbers):
-        arrays[name] = arrays[name].copy()
-        arrays[name].reshape(-1)[index] = value
-
-    return change
-
-
-def instead(name, value, part=0):
-    """A change of a whole array (part 0) or a number (part 1) of a snapshot."""
-    return lambda *snapshot: snapshot[part].__setitem__(name, value)
-
-
-def wrong_rng(**changes):
-    def change(arrays, numbers):
-        numbers["rng"] = numbers["rng"] | changes
-
-    return change
-
-
-# 2 streams of 12 slots, stack 3, horizon 2, after 21 observations: positions 9 .. 20 are there, and 11 .. 18
-# can be sampled, in slots 11, 0, 1, ... 6.
 @pytest.mark.parametrize(
-    ("change", "message"),
+    ("options", "message"),
     [
-        (lambda arrays, numbers: arrays.pop("age"), "arrays must be actions"),
-        (lambda arrays, numbers: numbers.pop("rng"), "numbers must be max_priority"),
-        (instead("frames", np.zeros(3)), "arrays must be"),
-        (instead("__class__", 1, 1), "numbers must be"),
-        (instead("actions", np.zeros((2, 12), np.int64)), r"actions must be int32 \(2, 12\)"),
-        (instead("rewards", np.zeros((2, 12), ">f4")), "rewards must be float32"),
-        (instead("flags", np.zeros((12, 2), np.uint8)), "flags must be"),
-        (instead("active", [True, True]), "active must be"),
-        (instead("priorities", np.full(24, None)), "priorities must be float64"),
-        (instead("priorities", np.zeros(23)), "priorities must be"),
-        (wrong("flags", 5, 4), "flags has unknown bits"),
-        (wrong("age", 5, 3), "age must be below 3"),
-        (wrong("next_position", 0, -1), "next_position is out of range"),
-        (wrong("next_position", 1, np.iinfo(np.int64).max), "next_position is out of range"),
-        (wrong("next_position", 1, np.iinfo(np.int64).min), "next_position is out of range"),
-        (wrong("next_position", 1, 22), "not those of transitions that can be sampled"),
-        (wrong("next_position", 1, 0), "active before anything is stored"),
-        (wrong("episode_start", 0, -1), "episode_start is out of range"),
-        (wrong("episode_start", 0, 21), "episode_start is out of range"),
-        (wrong("active", 0, False), "not those of transitions that can be sampled"),
-        (wrong("priorities", 0, -1.0), "priorities must lie in"),
-        (wrong("priorities", 0, np.nan), "priorities must lie in"),
-        (wrong("priorities", 0, np.inf), "priorities must lie in"),
-        (wrong("priorities", 0, 5.0), "priorities must lie in"),  # above the maximum
-        (wrong("priorities", 0, 0.0), "num_sampleable"),
-        (wrong("priorities", [0, 7], [0.0, 1.0]), "not those of transitions that can be sampled"),
-        (wrong("priorities", [0, 10], [0.0, 1.0]), "not those of transitions that can be sampled"),
-        (instead("num_sampleable", 15, 1), "num_sampleable"),
-        (instead("num_sampleable", 16.0, 1), "num_sampleable must be a int"),
-        (instead("num_sampleable", True, 1), "num_sampleable must be a int"),
-        (instead("num_transitions", 41, 1), "num_transitions"),
-        (instead("num_transitions", 42, 1), "num_transitions"),
-        (instead("num_transitions", -2, 1), "num_transitions"),
-        (instead("max_priority", 1, 1), "max_priority must be a float"),
-        (instead("max_priority", 0.5, 1), "max_priority is out of range"),
-        (instead("max_priority", float("nan"), 1), "max_priority is out of range"),
-        (instead("max_priority", 1e308, 1), "max_priority is out of range"),  # sums would overflow
-        (instead("rng", None, 1), "rng must be a state of PCG64"),
-        (instead("rng", [1, 2], 1), "rng must be a state of PCG64"),
-        (instead("rng", np.random.Generator(np.random.MT19937(0)).bit_generator.state, 1), "PCG64"),
-        (wrong_rng(bit_generator="PCG64DXSM"), "rng must be a state of PCG64"),
-        (wrong_rng(state={"state": 1}), "rng must be a state of PCG64"),
-        (wrong_rng(state={"state": 2**128, "inc": 1}), "rng must be a state of PCG64"),
-        (wrong_rng(state={"state": -1, "inc": 1}), "rng must be a state of PCG64"),
-        (wrong_rng(state={"state": "1", "inc": 1}), "rng must be a state of PCG64"),
-        (wrong_rng(uinteger=2**32), "rng must be a state of PCG64"),
-        (wrong_rng(more=1), "rng must be a state of PCG64"),
+        ({"slots": 13}, r"actions must be int32 \(2, 13\), got int32 \(2, 12\)"),
+        ({"num_streams": 3}, r"actions must be int32 \(3, 12\), got int32 \(2, 12\)"),
     ],
 )
-def test_a_bad_snapshot_is_refused_in_one_line_and_changes_nothing(change, message):
-    options = {"num_streams": 2, "stack": 3, "horizon": 2}
-    source, target = filled(20, **options).replay, Driver(**options).replay
-    assert np.flatnonzero(source.tree.leaves[:12]).tolist() == [0, 1, 2, 3, 4, 5, 6, 11]
-    arrays, numbers = source.snapshot()
-    change(arrays, numbers)
+def test_a_snapshot_of_another_replay_is_refused_in_one_line(options, message):
+    arrays, numbers = filled(20, num_streams=2, slots=12).replay.snapshot()
     with pytest.raises(ValueError, match=message) as error:
-        target.restore(arrays, numbers)
+        Driver(**{"num_streams": 2, "slots": 12, **options}).replay.restore(arrays, numbers)
     assert "\n" not in str(error.value)
-    same_state(target, Driver(**options).replay)
-
-
-VALUES = (0, 1, 2, 3, 5, 255, 1e-300, 1e300, -1, np.inf, np.nan, 2**31 - 1, 2**47, 2**63 - 1)
-
-
-@given(experience(), st.data())
-@settings(deadline=None, max_examples=60)
-def test_whatever_is_restored_can_be_gone_on_with(case, data):
-    # A snapshot made up by somebody who knows the checks: refused, or nothing goes wrong afterwards.
-    driver, events = case
-    for row in events:
-        driver.step(row)
-    arrays, numbers = driver.replay.snapshot()
-    for _ in range(data.draw(st.integers(1, 4))):
-        name = data.draw(st.sampled_from(list(arrays)))
-        index = data.draw(st.integers(0, arrays[name].size - 1))
-        with np.errstate(all="ignore"):
-            value = np.array(data.draw(st.sampled_from(VALUES))).astype(arrays[name].dtype)
-        wrong(name, index, value)(arrays, numbers)
-    numbers["max_priority"] = data.draw(st.sampled_from([1.0, 1e300, 1e306]))
-    numbers["num_sampleable"] = int(np.count_nonzero(arrays["priorities"] > 0))
-    replay = Replay(**driver.options)
-    try:
-        replay.restore(arrays, numbers)
-    except ValueError as error:
-        assert "\n" not in str(error)
-        return
-    n = replay.num_streams
-    zeros = np.zeros(n)
-    for i in range(2 * replay.slots):
-        if len(replay):
-            window, indices = replay.sample(4, 0.4)
-            assert np.isfinite(window.weight).all()
-            assert (indices >= 0).all()
-            replay.set_priorities(indices[:1], np.ones(1))
-        if not replay.active.all():
-            waiting = np.flatnonzero(~replay.active)
-            replay.begin(np.zeros((len(waiting), 2, 1, 2), np.uint8), waiting)
-        over = zeros.astype(bool) if i % 5 else ~zeros.astype(bool)
-        replay.add(zeros.astype(int), zeros, over, over, over, np.zeros((n, 2, 1, 2), np.uint8))
-        assert len(replay) == len(replay.sampleable()) == np.count_nonzero(replay.tree.leaves)
 
 
 @given(experience(), st.data())
@@ -286,12 +171,6 @@ def test_changed_slots_by_hand(before, after, slots):
     for _ in range(after - before):
         driver.step([STEP])
     assert np.flatnonzero(driver.replay.changed_slots(since)).tolist() == slots
-
-
-@pytest.mark.parametrize("since", [[-1, 0], [0, 5], [0], [0.0, 0.0]])
-def test_changed_slots_since_a_moment_that_never_was(since):
-    with pytest.raises(ValueError, match="since must"):
-        filled(3, num_streams=2).replay.changed_slots(np.array(since))
 
 
 def filled(steps=30, **options):
@@ -528,6 +407,5 @@ def test_memory_of_a_slot():
     replay = Replay(capacity=100_000, num_streams=10)
     assert replay.slots == 10_000
     assert replay.frames.nbytes == 100_000 * 7056
-    assert replay.frames.nbytes < replay.nbytes <= 100_000 * 7200
-    arrays = [value for value in vars(replay).values() if isinstance(value, np.ndarray)]
-    assert replay.nbytes == sum(array.nbytes for array in arrays) + replay.tree.nbytes
+    values = [*vars(replay).values(), *vars(replay.tree).values()]
+    assert sum(x.nbytes for x in values if isinstance(x, np.ndarray)) <= 100_000 * 7200

@@ -127,16 +127,9 @@ def test_probability_of_improvement_is_rliables(x, runs):
 def test_performance_profile_is_rliables_and_strictly_above():
     scores = np.array([[0.0, 1.0], [1.0, 3.0]])
     assert performance_profile(scores, [0, 1, 2, 3]).tolist() == [0.75, 0.25, 0.25, 0]
-    assert performance_profile(scores, [0.5, 1, 2], of="games").tolist() == [0.5, 0.5, 0]
     assert performance_profile({"a": [0, 1, 2, 3], "b": [5]}, [1.5]) == 0.75
-    for of, theirs in (
-        ("runs", library.score_distributions),
-        ("games", library.average_score_distributions),
-    ):
-        ours = performance_profile(SCORES, THRESHOLDS, of=of)
-        np.testing.assert_allclose(ours, theirs(SCORES, THRESHOLDS), atol=1e-12)
-    with pytest.raises(ValueError, match="must be runs or games"):
-        performance_profile(SCORES, THRESHOLDS, of="tasks")
+    theirs = library.score_distributions(SCORES, THRESHOLDS)
+    np.testing.assert_allclose(performance_profile(SCORES, THRESHOLDS), theirs, atol=1e-12)
 
 
 def _again(scores: np.ndarray) -> np.ndarray:

@@ -51,13 +51,13 @@ class Disk:
 
         return call
 
-    def write(self, path: Path, pieces: list) -> checkpoint.Entry:
+    def write(self, path: Path, *pieces) -> checkpoint.Entry:
         """`checkpoint.write`, which may find no room for the file, or for its second half."""
         self.operation(f"opening {path.suffix}")
-        data = b"".join(memoryview(piece).cast("B") for piece in pieces)
+        data = b"".join(pieces)
         path.write_bytes(data[: len(data) // 2])
         self.operation(f"writing {path.suffix}")
-        return _write(path, pieces)
+        return _write(path, *pieces)
 
     def patches(self) -> list:
         """For `mock.patch`."""

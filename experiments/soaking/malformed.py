@@ -17,12 +17,11 @@ from absl import flags
 
 from . import Count, Say
 from .malformed_cases import (
-    ARRAYS,
     CANARY,
+    CHECKPOINTS,
     FLAGS,
     KINDS,
     LINKS,
-    MANIFESTS,
     NAMES,
     PICKLES,
     PRESETS,
@@ -48,8 +47,8 @@ SHORT = (
     (PRESETS, "code"),
     (SPECS, "encoder 'sac_ae:features=2147483647'"),
     (TOGETHER, "a batch larger than the buffer"),
-    (MANIFESTS, "arrays in arrays, to encoder_from"),
-    (ARRAYS, "a Python number, to encoder_from"),
+    (CHECKPOINTS, "manifest.json: one bit differs, to encoder_from"),
+    (CHECKPOINTS, "params.msgpack: cut short, to encoder_from"),
     (PICKLES, "params.msgpack (binary), to train"),
     (NAMES, "out: with a line break"),
     (NAMES, "overwrite: a config 100,000 deep"),

@@ -91,13 +91,13 @@ class Faults:
         return call
 
     def _writing(self, function: Callable) -> Callable:
-        def write(path: Path, pieces: list):
+        def write(path: Path, *pieces):
             kind = path.suffix.removeprefix(".")
             self.point(f"before a file ({kind})")
-            half = memoryview(pieces[-1]).cast("B")
-            path.write_bytes(bytes(half[: len(half) // 2]))
+            data = b"".join(pieces)
+            path.write_bytes(data[: len(data) // 2])
             self.point(f"within a file ({kind})")
-            entry = function(path, pieces)
+            entry = function(path, *pieces)
             self.point(f"after a file ({kind})")
             return entry
 

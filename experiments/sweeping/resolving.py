@@ -62,7 +62,9 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Config]:
 
 def resolve_here(runs: Sequence[Planned]) -> dict[str, Config]:
     """`resolve` in this process; imports jax."""
-    from ..train import check_extras, resolved
+    from srl_jax.training import resolved
+
+    from ..train import check_extras
 
     configs: dict[str, Config] = {}
     known: dict[Config, Config] = {}  # what differs by the seed alone is resolved once

@@ -58,32 +58,22 @@ def collect(config: Config, horizon: int) -> HeldOut:
     Returns:
         Arrays that nobody may write to: seeds of one process share them.
     """
-    protocol = Protocol(
-        config.game, config.frame_size, config.frame_stack, config.sticky_actions, config.noop_max
-    )
-    return _collect(protocol, horizon, WINDOWS)
-
-
-class Protocol(NamedTuple):
-    """What a game's observations depend on; see `srl_jax.config.Config`."""
-
-    game: str
-    frame_size: int
-    frame_stack: int
-    sticky_actions: float
-    noop_max: int
+    protocol = config.game, config.frame_size, config.frame_stack, config.sticky_actions, config.noop_max
+    return _collect(*protocol, horizon, WINDOWS)
 
 
 @functools.lru_cache(maxsize=1)
-def _collect(protocol: Protocol, horizon: int, number: int) -> HeldOut:
+def _collect(
+    game: str, size: int, stack: int, sticky_actions: float, noop_max: int, horizon: int, number: int
+) -> HeldOut:
     steps = number * STRIDE // ENVS
     env = envs.make(
-        protocol.game,
+        game,
         num_envs=ENVS,
         seed=seed_for(SEED, "held out", "environments"),
-        frame_size=protocol.frame_size,
-        sticky_actions=protocol.sticky_actions,
-        noop_max=protocol.noop_max,
+        frame_size=size,
+        sticky_actions=sticky_actions,
+        noop_max=noop_max,
         with_state=True,
     )
     rng = np.random.default_rng(seed_for(SEED, "held out", "policy"))
@@ -96,10 +86,10 @@ def _collect(protocol: Protocol, horizon: int, number: int) -> HeldOut:
 
     replay = Replay(
         # As many slots as observations: every episode has one more of them than it has steps.
-        capacity=ENVS * (2 * len(actions) + protocol.frame_stack + horizon),
+        capacity=ENVS * (2 * len(actions) + stack + horizon),
         num_streams=ENVS,
         frame_shape=env.single_observation_space.shape,
-        stack=protocol.frame_stack,
+        stack=stack,
         horizon=horizon,
         alpha=0.0,
     )

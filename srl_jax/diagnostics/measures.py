@@ -68,14 +68,6 @@ def mean_cosine(a: np.ndarray, b: np.ndarray) -> float:
         return float(((a * b).sum(1) / norms).mean())
 
 
-def linear_cka(a: np.ndarray, b: np.ndarray) -> float:
-    """Linear centred kernel alignment (Kornblith et al. 2019, section 3), [N, D] and [N, E].
-
-    Rotations of a latent and its scale do not matter to it. In [0, 1]; NaN where one is constant.
-    """
-    return alignment(centred_gram(a), centred_gram(b))
-
-
 def centred_gram(x: np.ndarray) -> np.ndarray:
     """Inner products of rows, their mean taken off: [N, D] -> float64 [N, N] of norm 1, or NaN."""
     x = x.astype(np.float64)
@@ -86,7 +78,10 @@ def centred_gram(x: np.ndarray) -> np.ndarray:
 
 
 def alignment(a: np.ndarray, b: np.ndarray) -> float:
-    """`linear_cka` of two `centred_gram`s."""
+    """Linear centred kernel alignment (Kornblith et al. 2019, section 3) of two `centred_gram`s.
+
+    Rotations of a latent and its scale do not matter to it. In [0, 1]; NaN where one is constant.
+    """
     return float((a * b).sum())
 
 

@@ -3,20 +3,22 @@
 `observation_shape` is (H, W, S * C), of any size from the least that the layers fit. Each comes with the
 decoder that mirrors it, and all have the options `init`, `zero_sum`, `gain` and `decoder_scale`: see
 `srl_jax.encoders.convolutional.Start`. `flax_encoder` makes an encoder of any flax module.
+`from_npz` loads one that `srl-jax export` has written.
 """
 
 from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder
+from srl_jax.encoders.files import from_npz, to_npz
 from srl_jax.encoders.impala import impala
 from srl_jax.plugins import Registry
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
-__all__ = ["REGISTRY", "register", "flax_encoder", "impala", "nature", "sac_ae", "tiny"]
+__all__ = ["REGISTRY", "register", "flax_encoder", "from_npz", "impala", "nature", "sac_ae", "tiny", "to_npz"]
 
 
 def nature(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     *,
     init: str = "pytorch",
     zero_sum: bool = False,
@@ -33,7 +35,7 @@ def nature(
 
 
 def sac_ae(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     *,
     features: int = 256,
     layer_norm: bool = True,
@@ -58,7 +60,7 @@ def sac_ae(
 
 
 def tiny(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     *,
     features: int = 64,
     init: str = "pytorch",

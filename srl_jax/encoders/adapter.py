@@ -1,6 +1,7 @@
 """An `Encoder` of any flax module."""
 
 from collections.abc import Callable
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -50,14 +51,17 @@ def flax_encoder(
     return Encoder(init, apply, features, tuple(shape), make_decoder, map_shape)
 
 
-def _functions(network: nn.Module, example: jax.ShapeDtypeStruct) -> tuple[Callable, Callable]:
+def _functions(
+    network: nn.Module, example: jax.ShapeDtypeStruct
+) -> tuple[Callable[[jax.Array], Params], Callable[[Params, Array], jax.Array]]:
     """key -> params, and (params, inputs) -> outputs."""
 
-    def init(key: Array) -> Params:
+    def init(key: jax.Array) -> Params:
         return network.init(key, jnp.zeros(example.shape, example.dtype)).get("params", {})
 
-    def apply(params: Params, x: Array) -> Array:
-        return network.apply({"params": params}, x)
+    def apply(params: Params, x: Array) -> jax.Array:
+        output: Any = network.apply({"params": params}, x)
+        return output
 
     return init, apply
 

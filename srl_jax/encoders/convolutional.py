@@ -139,7 +139,7 @@ class DecoderNetwork(nn.Module):
 
 
 def convolutional_encoder(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     layers: Sequence[Layer],
     start: Start,
     *,

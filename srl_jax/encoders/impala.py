@@ -114,7 +114,7 @@ def doubled(x: Array, size: tuple[int, int]) -> Array:
 
 
 def impala(
-    observation_shape: tuple,
+    observation_shape: tuple[int, int, int],
     *,
     features: int = 256,
     width: int = 1,

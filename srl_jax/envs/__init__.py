@@ -50,10 +50,8 @@ def make(
     frame_size: int = 84,
     sticky_actions: float = 0.0,
     noop_max: int = 30,
-    full_action_space: bool = False,
     max_frames: int = MAX_FRAMES,
     reseed_every: int = 5_000,
-    num_threads: int = 0,
     with_state: bool = False,
 ):
     """Makes `num_envs` copies of a game.
@@ -68,10 +66,8 @@ def make(
         frame_size: height and width of a frame in pixels; for Catch 84 or 42.
         sticky_actions: probability of repeating the last action, per emulator frame.
         noop_max: see `atari.Atari`.
-        full_action_space: all of the console's actions instead of those that the game uses.
         max_frames: emulator frames (4 per env step) after which an episode is truncated.
         reseed_every: env steps between two seeded resets of one environment, see `atari.Atari`.
-        num_threads: threads that step the emulators; 0 lets ALE choose.
         with_state: `info["state"]` also where it takes time to know it: see `ram.AtariWithState`.
 
     Returns:
@@ -85,10 +81,8 @@ def make(
     given = {
         "sticky_actions": sticky_actions,
         "noop_max": noop_max,
-        "full_action_space": full_action_space,
         "max_frames": max_frames,
         "reseed_every": reseed_every,
-        "num_threads": num_threads,
         "with_state": with_state,
     }
     row = _game(game)

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, Space
 
 from srl_jax.envs import pixels
-from srl_jax.envs.base import Form, FrameVectorEnv
+from srl_jax.envs.base import FrameVectorEnv
 from srl_jax.errors import ConfigError
 
 PACKAGES = {"MiniGrid": "minigrid", "BabyAI": "minigrid", "MiniWorld": "miniworld", "ALE": "ale_py"}
@@ -188,25 +188,12 @@ class Adapter(FrameVectorEnv):
     def _seen(self):
         return self._frames.copy()
 
-    def _forms(self):
-        number = (self.num_envs,)
-        return {
-            "episodes": Form(np.int64, number, 1),
-            "actions": Form(np.int32, (None,), 0, int(self.single_action_space.n) - 1),
-            "action_counts": Form(np.int64, number, 0),
-        }
-
     def _snapshot(self):
         return {
             "episodes": self._episodes.copy(),
             "actions": np.array(sum(self._actions, []), np.int32),
             "action_counts": np.array([len(actions) for actions in self._actions], np.int64),
         }
-
-    def _check_snapshot(self, arrays):
-        actions, total = arrays["actions"], sum(arrays["action_counts"].tolist())  # int64 might overflow
-        if total != len(actions):
-            raise ValueError(f"action_counts of the snapshot add up to {total}, actions are {len(actions)}")
 
     def _restore(self, arrays):
         self._episodes = arrays["episodes"] - 1

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 import numpy as np
 from gymnasium.vector import AutoresetMode
 
-from srl_jax.envs.base import Form, FrameVectorEnv
+from srl_jax.envs.base import FrameVectorEnv
 from srl_jax.envs.games import FRAME_SKIP, MAX_FRAMES, rom_name
 
 try:
@@ -61,10 +61,8 @@ class Atari(FrameVectorEnv):
         frame_size: int = 84,
         sticky_actions: float = 0.0,
         noop_max: int = 30,
-        full_action_space: bool = False,
         max_frames: int = MAX_FRAMES,
         reseed_every: int = 5_000,
-        num_threads: int = 0,
     ):
         """Loads the game.
 
@@ -76,11 +74,9 @@ class Atari(FrameVectorEnv):
             sticky_actions: probability of repeating the last action, per emulator frame.
             noop_max: an episode starts with a random number of no-ops below this (the FIRE counts
                 as one); 0 and 1 mean none.
-            full_action_space: all of the console's actions instead of those that the game uses.
             max_frames: emulator frames after which an episode is truncated.
             reseed_every: env steps between two seeded resets of one environment; 0 seeds every
                 reset.
-            num_threads: threads that step the emulators; 0 lets ALE choose.
 
         Raises:
             ValueError: unknown game, or an option out of its range.
@@ -91,7 +87,6 @@ class Atari(FrameVectorEnv):
             ("noop_max", noop_max, 0),
             ("max_frames", max_frames, 1),
             ("reseed_every", reseed_every, 0),
-            ("num_threads", num_threads, 0),
         ):
             if value < least:
                 raise ValueError(f"{name} must be at least {least}, got {value}")
@@ -102,11 +97,11 @@ class Atari(FrameVectorEnv):
             rom_name(game),
             num_envs,
             batch_size=0,  # wait for all: results of smaller batches come in no fixed order
-            num_threads=num_threads,
+            num_threads=0,  # as ALE chooses; results do not depend on it
             thread_affinity_offset=-1,
             max_num_frames_per_episode=max_frames,
             repeat_action_probability=sticky_actions,
-            full_action_space=full_action_space,
+            full_action_space=False,
             continuous=False,
             # ALE has no mode without autoreset. In this one it would come a step late, and `step`
             # refuses to go on before an ended environment has been reset, so it never comes.
@@ -196,16 +191,6 @@ class Atari(FrameVectorEnv):
     def _seen(self):
         return shown(self._look()[0])
 
-    def _forms(self):
-        number = (self.num_envs,)
-        return {
-            "ale_seeds": Form(np.int64, number, 1, 2**31 - 1),
-            "seeded_resets": Form(np.int64, number, 1),
-            "steps_since_seeded": Form(np.int64, number, 0),
-            "events": Form(np.uint8, (None,)),
-            "event_counts": Form(np.int64, number, 0),
-        } | {name: Form(np.int32, number, 0) for name in COUNTERS}
-
     def _snapshot(self):
         info = self._look()[1]
         written = np.arange(self._log.shape[1]) < self._log_lengths[:, None]
@@ -216,21 +201,6 @@ class Atari(FrameVectorEnv):
             "events": self._log[written],
             "event_counts": self._log_lengths.copy(),
         } | {name: np.array(info[name]) for name in COUNTERS}
-
-    def _check_snapshot(self, arrays):
-        events, counts = arrays["events"], arrays["event_counts"]
-        total = sum(counts.tolist())  # int64 might overflow
-        if total != len(events):
-            raise ValueError(f"event_counts of the snapshot add up to {total}, events are {len(events)}")
-        unknown = (events >= self.single_action_space.n) & (events != RESET)
-        if unknown.any():
-            raise ValueError(f"events of the snapshot are no actions of the game: {events[unknown][0]}")
-        steps = [int((log != RESET).sum()) for log in logs_of(arrays)]
-        resets = arrays["seeded_resets"].tolist()
-        seeds = [self._ale_seed(i, number - 1) for i, number in enumerate(resets)]
-        for name, expected in (("steps_since_seeded", steps), ("ale_seeds", seeds)):
-            if arrays[name].tolist() != expected:
-                raise ValueError(f"{name} of the snapshot must be {expected}, got {arrays[name].tolist()}")
 
     def _restore(self, arrays):
         logs = logs_of(arrays)

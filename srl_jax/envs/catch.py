@@ -14,14 +14,15 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from srl_jax.envs.base import Form, FrameVectorEnv
-from srl_jax.envs.games import BACKGROUNDS
+from srl_jax.envs.base import FrameVectorEnv
 
 GRID = 84
 """The game is played on an integer grid of GRID x GRID, whatever the size of the frames."""
 ACTIONS = ("LEFT", "NOOP", "RIGHT")
 STATE = ("ball_x", "ball_y", "ball_velocity_x", "ball_velocity_y", "paddle_x")
 """The names of what `info["state"]` holds."""
+OWN = ("ball_x", "ball_y", "drift", "fall", "paddle", "episodes")
+"""The arrays int64 [N] that a snapshot holds, attributes by these names behind an underscore."""
 
 PADDLE_RADIUS = 6
 PADDLE_SPEED = 4
@@ -88,8 +89,6 @@ class Catch(FrameVectorEnv):
         """
         if size not in (GRID, GRID // 2):
             raise ValueError(f"the frame size of Catch must be 84 or 42, got {size}")
-        if not 1 <= ball <= 12:
-            raise ValueError(f"the ball of Catch must be of 1 to 12 pixels, got {ball}")
         super().__init__(num_envs=num_envs, seed=seed, frame_shape=(size, size, 1), action_meanings=ACTIONS)
         self._ball_x, self._ball_y, self._drift, self._fall, self._paddle = np.zeros((5, num_envs), np.int64)
         self._episodes = np.zeros(num_envs, np.int64)
@@ -153,35 +152,15 @@ class Catch(FrameVectorEnv):
         beside = ball_x - self._paddle
         return (self._reach[0] <= beside) & (beside <= self._reach[1])
 
-    def _forms(self):
-        integers = {
-            "ball_x": (self._left, self._right),
-            "ball_y": (self._left, self._last_row),
-            "drift": (-MAX_DRIFT, MAX_DRIFT),
-            "fall": (int(DROPS[:, 0].min()), int(DROPS[:, 0].max())),
-            "paddle": (PADDLE_LEFT, PADDLE_RIGHT),
-            "episodes": (1, None),
-        }
-        forms = {name: Form(np.int64, (self.num_envs,), *limits) for name, limits in integers.items()}
-        return forms | ({} if self._background is None else self._background.forms())
-
     def _snapshot(self):
-        arrays = {
-            "ball_x": self._ball_x,
-            "ball_y": self._ball_y,
-            "drift": self._drift,
-            "fall": self._fall,
-            "paddle": self._paddle,
-            "episodes": self._episodes,
-        }
+        arrays = {name: getattr(self, f"_{name}") for name in OWN}
         if self._background is not None:
             arrays |= self._background.arrays()
         return {name: array.copy() for name, array in arrays.items()}
 
     def _restore(self, arrays):
-        self._ball_x, self._ball_y = arrays["ball_x"].copy(), arrays["ball_y"].copy()
-        self._drift, self._fall = arrays["drift"].copy(), arrays["fall"].copy()
-        self._paddle, self._episodes = arrays["paddle"].copy(), arrays["episodes"].copy()
+        for name in OWN:
+            setattr(self, f"_{name}", arrays[name].copy())
         if self._background is not None:
             self._background.restore(arrays)
         return {"ended": self._ball_y >= self._last_row}
@@ -241,8 +220,6 @@ class Background:
     """
 
     def __init__(self, kind: str, num_envs: int, scale: int, stream):
-        if kind not in BACKGROUNDS[1:]:
-            raise ValueError(f"background must be one of {', '.join(BACKGROUNDS)}, got {kind!r}")
         self._kind = kind
         self._scale = scale
         self._stream = stream
@@ -283,15 +260,6 @@ class Background:
         # Never zero, so that both layers always move.
         speed = rng.integers(1, MAX_SCROLL + 1, size=(2, 2))
         self._velocity[i] = speed * rng.choice((-1, 1), size=(2, 2))
-
-    def forms(self) -> dict[str, Form]:
-        """What `arrays` gives."""
-        number = len(self._time)
-        return {
-            "background_time": Form(np.int64, (number,), 0),
-            "background_offset": Form(np.int64, (number, 2, 2), 0, TORUS - 1),
-            "background_velocity": Form(np.int64, (number, 2, 2), -MAX_SCROLL, MAX_SCROLL),
-        }
 
     def arrays(self) -> dict[str, np.ndarray]:
         """The state by name, not copied."""

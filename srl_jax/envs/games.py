@@ -98,8 +98,8 @@ def atari(*, game: str = "Pong") -> Game:
                 "Atari needs ale-py, pip install 'srl-jax[atari]'; valid without it: Catch, CatchDistractor"
             )
 
-    options = ("sticky_actions", "noop_max", "full_action_space", "max_frames", "reseed_every", "num_threads")
-    return Game(make, check, (*options, "with_state"), frames_per_step=FRAME_SKIP, lives=True)
+    options = ("sticky_actions", "noop_max", "max_frames", "reseed_every", "with_state")
+    return Game(make, check, options, frames_per_step=FRAME_SKIP, lives=True)
 
 
 def catch(*, ball: int = 3, background: str = "none") -> Game:

@@ -91,25 +91,14 @@ def probability_of_improvement(x: Scores, y: Scores) -> np.ndarray:
     return np.mean(wins, axis=0)
 
 
-def performance_profile(scores: Scores, thresholds: Sequence[float], of: str = "runs") -> np.ndarray:
-    """The share of scores above each threshold.
-
-    Args:
-        scores: of one arm.
-        thresholds: [T].
-        of: "runs": share of runs, averaged over games, the run-score distribution; "games": share of games
-            whose mean is above it, the average-score distribution.
+def performance_profile(scores: Scores, thresholds: Sequence[float]) -> np.ndarray:
+    """The run-score distribution: the share of runs above each threshold [T], averaged over games.
 
     Returns:
         float64 [..., T].
     """
-    thresholds = np.asarray(thresholds, np.float64)
-    if of == "games":
-        return (_game_means(scores)[..., None] > thresholds).mean(-2)
-    if of != "runs":
-        raise ValueError(f"of={of!r}: must be runs or games")
     games = by_game(scores)
-    return sum((x[..., None] > thresholds).mean(-2) for x in games.values()) / len(games)
+    return sum((x[..., None] > np.asarray(thresholds)).mean(-2) for x in games.values()) / len(games)
 
 
 AGGREGATES: dict[str, Statistic] = {

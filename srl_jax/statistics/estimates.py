@@ -60,9 +60,8 @@ def estimate_difference(
     y: Scores,
     statistic: Statistic = mean,
     *,
-    repetitions: int = REPETITIONS,
     level: float = 0.95,
-    seed: int = 0,
+    **how: int,
 ) -> Interval:
     """The statistic of x less that of y, and the interval that is right for it.
 
@@ -70,9 +69,8 @@ def estimate_difference(
         x: scores of one arm.
         y: scores of another one, of the same games; its numbers of runs may differ.
         statistic: of one arm.
-        repetitions: of the bootstrap.
         level: of the interval.
-        seed: of the bootstrap's draws.
+        **how: repetitions and seed, see `estimate`.
 
     Raises:
         ValueError: the games differ, or see `bootstrap`.
@@ -81,25 +79,17 @@ def estimate_difference(
     check_games(ours, theirs)
     if (runs := _runs(statistic, ours)) is not None:
         return mean_difference(runs, _runs(statistic, theirs), level)
-    return bootstrap_difference(ours, theirs, statistic, repetitions=repetitions, level=level, seed=seed)
+    return bootstrap_difference(ours, theirs, statistic, level=level, **how)
 
 
-def curve_interval(
-    returns: Any,
-    statistic: Statistic = mean,
-    *,
-    repetitions: int = REPETITIONS,
-    level: float = 0.95,
-    seed: int = 0,
-) -> Interval:
+def curve_interval(returns: Any, statistic: Statistic = mean, *, level: float = 0.95, **how: int) -> Interval:
     """A statistic of learning curves, and at each point the interval that is right for it.
 
     Args:
         returns: float64 [runs, points] of one game, [runs, games, points], or game -> [runs, points].
         statistic: of one arm's scores.
-        repetitions: of the bootstrap.
         level: of the interval at one point; not of the whole curve.
-        seed: of the bootstrap's draws.
+        **how: repetitions and seed, see `estimate`.
 
     Returns:
         An Interval of arrays [points].
@@ -110,7 +100,7 @@ def curve_interval(
     games = curves_by_game(returns)
     if (runs := _runs(statistic, games)) is not None:
         return mean_interval(runs, level)
-    return bootstrap_curve(returns, statistic, repetitions=repetitions, level=level, seed=seed)
+    return bootstrap_curve(returns, statistic, level=level, **how)
 
 
 def _runs(statistic: Statistic, games: Mapping[str, np.ndarray]) -> np.ndarray | None:

@@ -1,0 +1,55 @@
+"""Writes a run's encoder to a file that numpy can read: `srl-jax export runs/x --encoder=enc.npz`.
+
+Each parameter is an array by its name, as Conv_0/kernel; "about" is a JSON text: the specification of the
+encoder, the shape of an observation, the size of the latent, the game, the env steps. A run's newest
+checkpoint is meant; one of them, its best/ and what is kept in its encoders/ can be named, too.
+srl_jax.encoders.from_npz loads the file.
+"""
+
+from absl import flags
+
+from srl_jax.errors import ConfigError
+
+from . import flags as config_flags
+from . import runtime
+
+FLAGS = flags.FLAGS
+
+
+def main(argv: list[str]) -> None:
+    """The entry point."""
+    del argv
+    if not FLAGS.run:
+        raise ConfigError("--run: missing; name a run directory or a checkpoint, --run=runs/NAME")
+    if not FLAGS.encoder:
+        raise ConfigError("--encoder: missing; name the file to write, --encoder=enc.npz")
+    path = config_flags.check_file("encoder", FLAGS.encoder, ".npz", overwrite=FLAGS.overwrite)
+    runtime.check_device()
+
+    from srl_jax import encoders, loading
+
+    loaded = loading.load(FLAGS.run, imports=FLAGS["import"].value)
+    config, encoder = loaded.config, loaded.encoder
+    about = {"game": config.game, "env_steps": loaded.env_steps}
+    encoders.to_npz(path, encoder, loaded.params["encoder"], config.encoder, **about)
+    shape = list(encoder.observation_shape)
+    print(f"{path}: {config.encoder.partition(':')[0]}, observations {shape} to {encoder.features} numbers")
+
+
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines this entry point's flags."""
+    run = "run directory, one of its checkpoints, or an encoder that was kept"
+    flags.DEFINE_string("run", "", run, flag_values=values)
+    flags.DEFINE_string("encoder", "", "file to write, which ends in .npz", flag_values=values)
+    flags.DEFINE_boolean("overwrite", False, "replace the file if there is one", flag_values=values)
+    config_flags.define_import_flag(values)
+
+
+def cli() -> None:
+    """Runs this entry point as a program."""
+    define_flags()
+    config_flags.run(main, positional="run")
+
+
+if __name__ == "__main__":
+    cli()

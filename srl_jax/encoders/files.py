@@ -1,0 +1,82 @@
+"""A trained encoder as one npz file, for which numpy is enough."""
+
+import json
+import os
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+from flax.serialization import to_state_dict
+from flax.traverse_util import flatten_dict, unflatten_dict
+
+from srl_jax import checkpoint, encoders, specs
+from srl_jax.errors import ConfigError, SaveError
+from srl_jax.types import Encoder, Params
+
+ABOUT = "about"
+"""The name of the array that holds a JSON text; all others are parameters."""
+
+
+def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec: str, **about: Any) -> None:
+    """Writes an encoder's parameters, each by its path in the tree, as "Conv_0/kernel", and `ABOUT`.
+
+    Args:
+        path: of the file; what lies there is replaced, once the new one is whole.
+        encoder: whose they are.
+        params: a tree of arrays.
+        spec: `name:key=value,...`, which makes the encoder.
+        **about: more that `ABOUT` says beside "encoder" (the spec), "observation_shape" and "features".
+
+    Raises:
+        ConfigError: a parameter has the name of `ABOUT`.
+        SaveError: it could not be written.
+    """
+    path = Path(path)
+    arrays: dict[str, Any] = {
+        name: np.asarray(x) for name, x in flatten_dict(to_state_dict(params), sep="/").items()
+    }
+    if ABOUT in arrays:
+        raise ConfigError(f"{path}: the encoder {spec} has a parameter {ABOUT}, a name that the file needs")
+    shape = list(encoder.observation_shape)
+    text = {"encoder": spec, "observation_shape": shape, "features": encoder.features, **about}
+    arrays[ABOUT] = np.array(json.dumps(text))
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        with open(partial, "wb") as file:
+            np.savez(file, **arrays)
+        os.replace(partial, path)
+    except OSError as error:
+        partial.unlink(missing_ok=True)
+        raise SaveError(f"{path}: not written: {error.strerror}") from error
+
+
+def from_npz(path: str | os.PathLike[str]) -> tuple[Encoder, Params]:
+    """Reads an encoder that `srl-jax export` has written.
+
+        encoder, params = srl_jax.encoders.from_npz("enc.npz")
+        latents = encoder.apply(params, observations)  # uint8 [B, H, W, S * C] -> float32 [B, D]
+
+    An encoder of your own has to be registered first, as by importing its file.
+
+    Raises:
+        srl_jax.errors.ConfigError: there is no such file, or it is not what export writes, or does not fit
+            this code; one line.
+    """
+    try:
+        with open(path, "rb") as file, np.load(file, allow_pickle=False) as content:
+            arrays = {name: content[name] for name in content.files}
+        about = json.loads(str(arrays.pop(ABOUT)))
+        spec, shape = str(about["encoder"]), tuple(map(int, about["observation_shape"]))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror or error}") from None
+    except (ValueError, TypeError, KeyError, AttributeError, EOFError, zipfile.BadZipFile):
+        raise ConfigError(f"{path}: not an encoder that srl-jax export has written") from None
+    try:
+        row = specs.parse(spec, encoders.REGISTRY)
+        encoder = specs.build(row, encoders.REGISTRY, shape)
+        template = jax.eval_shape(encoder.init, jax.random.key(0))
+    except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
+        raise ConfigError(f"{path}: {error}") from None
+    return encoder, checkpoint.load_into(template, unflatten_dict(arrays, sep="/"), os.fspath(path))

@@ -1,0 +1,98 @@
+"""Training as one call, and the checks that come before. Imports no jax until they need it."""
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from srl_jax import checkpoint, envs, modes, plugins
+from srl_jax.config import Config, resolve
+from srl_jax.errors import ConfigError
+from srl_jax.rundir import run_directory
+from srl_jax.specs import build, parse
+
+if TYPE_CHECKING:
+    from srl_jax.loop import Result
+
+
+def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True) -> "Result":
+    """Trains one agent and writes its run directory, as `srl-jax train` does but for the figures.
+
+    `srl-jax resume` resumes it, `srl-jax draw` draws its figures, `srl_jax.load` loads it. Ctrl-C
+    ends it and leaves the last checkpoint. The command also sets what jax runs well with on a CPU before jax
+    is imported; here the environment is as the caller has it.
+
+    Args:
+        config: see its fields; what it leaves to defaults is written out in config.json.
+        out: the run directory, new or empty.
+        progress: whether to draw a progress bar on stderr.
+
+    Returns:
+        How the run ended; what came of it is in `out`.
+
+    Raises:
+        ConfigError: the configuration cannot be run, or the directory is not empty; nothing was written.
+        SaveError, Diverged: see `srl_jax.loop.train_seeds`.
+    """
+    path = Path(out)
+    try:
+        taken = path.exists() and (not path.is_dir() or any(path.iterdir()))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    if taken:
+        raise ConfigError(
+            f"{path}: not an empty directory; name a new one (srl-jax resume resumes a run)"
+        )
+    modes.check(config)
+    check_game(config)
+    full = resolved(config)
+    checkpoint.check_sources(full)
+
+    from srl_jax import loop
+
+    with run_directory(path, full):
+        return loop.train(full, path, progress=progress)
+
+
+def check_game(config: Config, imported: bool = False) -> None:
+    """Whether the game's environments can be made here; one of a plug-in is known once that is `imported`.
+
+    Raises:
+        ConfigError: they cannot; the line says why.
+    """
+    try:
+        game = envs.game(config.game)
+    except ConfigError:
+        if imported or not config.imports:
+            raise
+        return
+    try:
+        game.check()
+    except ConfigError as error:
+        raise ConfigError(f"--game={config.game}: {error}") from None
+
+
+def resolved(config: Config) -> Config:
+    """`srl_jax.config.resolve` with the registries and what --import adds, and a trial build; imports jax.
+
+    Raises:
+        ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
+            these frames.
+    """
+    from srl_jax import encoders, objectives, rl
+    from srl_jax.types import Context
+
+    if config.imports:
+        plugins.load(config.imports)
+        check_game(config, imported=True)
+    full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
+    # Options may be valid one by one and not together, or not for these frames: only a factory
+    # knows. The number of actions is not known yet; any will do for that.
+    size = config.frame_size or 84  # an environment's own is known once it is made
+    shape = (size, size, config.frame_stack)
+    encoder = build(parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
+    context = Context.of(encoder, num_actions=18)
+    build(parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
+    for text in config.objectives:
+        objective = parse(text, objectives.REGISTRY, "objective")
+        build(objective, objectives.REGISTRY, context)
+    return full

@@ -1,0 +1,149 @@
+"""experiments/export.py and srl_jax/encoders/files.py: an encoder in a file that numpy reads."""
+
+import errno
+import json
+import os
+import zipfile
+
+import numpy as np
+import pytest
+from absl import flags
+
+import srl_jax
+from experiments import export
+from experiments import flags as config_flags
+from srl_jax.errors import ConfigError, SaveError
+from tests.helpers import JOINT, identical, write_checkpoint
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    path = tmp_path_factory.mktemp("runs") / "run"
+    write_checkpoint(path, **JOINT)
+    write_checkpoint(path, env_steps=120, folder="encoders", only=["encoder"], **JOINT)
+    return path
+
+
+@pytest.fixture
+def exported(monkeypatch):
+    """Runs the command, whose arguments it takes."""
+
+    def call(*arguments):
+        values = flags.FlagValues()
+        export.define_flags(values)
+        config_flags.parse(["export", *map(str, arguments)], values, positional="run")
+        monkeypatch.setattr(export, "FLAGS", values)
+        export.main(["export"])
+
+    return call
+
+
+def test_numpy_alone_reads_it(run, exported, tmp_path, capsys):
+    path = tmp_path / "enc.npz"
+    exported(run, f"--encoder={path}")
+    assert capsys.readouterr().out == f"{path}: tiny, observations [42, 42, 4] to 8 numbers\n"
+    with np.load(path, allow_pickle=False) as file:
+        arrays = dict(file)
+    about = json.loads(str(arrays.pop("about")))
+    assert about == {
+        "encoder": "tiny:features=8",
+        "observation_shape": [42, 42, 4],
+        "features": 8,
+        "game": "Catch",
+        "env_steps": 240,
+    }
+    own = srl_jax.load(run).params["encoder"]
+    assert set(arrays) == {f"{layer}/{name}" for layer in own for name in own[layer]}
+    assert arrays["Conv_0/kernel"].shape == (6, 6, 4, 16) and arrays["LayerNorm_0/scale"].dtype == np.float32
+    np.testing.assert_array_equal(arrays["Dense_0/kernel"], own["Dense_0"]["kernel"])
+
+
+def test_it_is_loaded_without_the_run(run, exported, tmp_path):
+    for place, env_steps in ((run, 240), (run / "encoders" / "000000120", 120)):
+        path = tmp_path / f"{env_steps}.npz"
+        exported(place, f"--encoder={path}")
+        encoder, params = srl_jax.encoders.from_npz(path)
+        loaded = srl_jax.load(place)
+        assert identical(params, loaded.params["encoder"]) and loaded.env_steps == env_steps
+        x = np.random.default_rng(0).integers(0, 256, (2, 42, 42, 4), dtype=np.uint8)
+        np.testing.assert_allclose(encoder.apply(params, x), loaded.encode(x), atol=1e-5)
+
+
+def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, exported, tmp_path):
+    file = tmp_path / "enc.npz"
+    for arguments, message in (
+        ((), "--run: missing"),
+        ((run,), "--encoder: missing; name the file to write"),
+        ((run, f"--encoder={tmp_path / 'enc'}"), "--encoder=.*enc: must end in .npz"),
+        ((run, f"--encoder={tmp_path / 'no' / 'enc.npz'}"), "--encoder=.*: no such directory"),
+        ((tmp_path / "no", f"--encoder={file}"), ".*no: no checkpoint there"),
+        (
+            (run, f"--encoder={file}", "--import=no_such_module"),
+            "--import=no_such_module: ModuleNotFoundError",
+        ),
+    ):
+        with pytest.raises(ConfigError, match=f"^{message}"):
+            exported(*arguments)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_that_is_there_is_replaced_only_if_asked(run, exported, tmp_path):
+    path = tmp_path / "enc.npz"
+    path.write_text("mine")
+    with pytest.raises(ConfigError, match="enc.npz: exists; name a new file, or --overwrite replaces it$"):
+        exported(run, f"--encoder={path}")
+    with pytest.raises(ConfigError):
+        exported(tmp_path / "no", f"--encoder={path}", "--overwrite")
+    assert path.read_text() == "mine"
+    exported(run, f"--encoder={path}", "--overwrite")
+    assert srl_jax.encoders.from_npz(path)[0].features == 8
+    (tmp_path / "folder.npz").mkdir()
+    with pytest.raises(ConfigError, match="exists and is not a file"):
+        exported(run, f"--encoder={tmp_path / 'folder.npz'}", "--overwrite")
+
+
+def test_a_full_disk_leaves_what_was_there(run, exported, tmp_path, monkeypatch):
+    path = tmp_path / "enc.npz"
+    path.write_text("mine")
+
+    def full(file, **arrays):
+        file.write(b"half")
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(np, "savez", full)
+    with pytest.raises(SaveError, match="enc.npz: not written: No space left on device"):
+        exported(run, f"--encoder={path}", "--overwrite")
+    assert [file.name for file in tmp_path.iterdir()] == ["enc.npz"] and path.read_text() == "mine"
+
+
+def test_what_export_has_not_written_is_refused(run, exported, tmp_path):
+    good, bad = tmp_path / "good.npz", tmp_path / "bad.npz"
+    exported(run, f"--encoder={good}")
+    with np.load(good) as file:
+        arrays = dict(file)
+    about = json.loads(str(arrays["about"]))
+
+    def refused(message):
+        with pytest.raises(ConfigError, match=f"^{bad}: {message}"):
+            srl_jax.encoders.from_npz(bad)
+
+    refused("No such file")
+    for data in (b"", b"text", good.read_bytes()[:-40]):
+        bad.write_bytes(data)
+        refused("not an encoder that srl-jax export has written")
+    np.save(bad.with_suffix(".npy"), np.zeros(3))
+    bad.write_bytes(bad.with_suffix(".npy").read_bytes())
+    refused("not an encoder that srl-jax export has written")
+    with zipfile.ZipFile(bad, "w") as file:
+        file.writestr("about.npy", b"no array")
+    refused("not an encoder that srl-jax export has written")
+    for change, message in (
+        ({"encoder": "own:features=8"}, "'own:features=8': no 'own'; valid: nature"),
+        ({"encoder": "tiny:features=9"}, "parameter .* is float32 .*8.*, not float32 .*9"),
+        ({"observation_shape": [2, 2, 4]}, ".*frames of 2 pixels are too small"),
+        ({"observation_shape": "wide"}, "not an encoder that srl-jax export has written"),
+    ):
+        np.savez(bad, **{**arrays, "about": np.array(json.dumps({**about, **change}))})
+        refused(message)
+    np.savez(bad, **{name: x for name, x in arrays.items() if name != "Conv_1/bias"})
+    refused("parameters do not fit: .*Conv_1.*bias.* is on one side only")

@@ -1,0 +1,55 @@
+"""srl_jax/training.py: a run by one call, as the command makes it."""
+
+import numpy as np
+import pytest
+
+import srl_jax
+from srl_jax import ending
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
+from srl_jax.metrics import read_metrics
+from srl_jax.training import resolved
+from tests.helpers import SMALL
+
+
+def test_a_run_is_trained_into_a_new_directory_and_loaded(tmp_path):
+    path = tmp_path / "runs" / "x"
+    config = Config(**{**SMALL, "steps": 120, "eval_every": 60, "keep_encoder_every": 1})
+    result = srl_jax.train(config, str(path), progress=False)
+    assert (result.env_steps, result.interrupted) == (120, False)
+    assert ending.read(path).status == "finished" and not (path / "lock").exists()
+    # config.json has every option, as the command writes it.
+    assert Config.load(path) == resolved(config) != config
+    assert read_metrics(path / "metrics.jsonl")[-1]["env_steps"] == 120
+    loaded = srl_jax.load(path)
+    assert loaded.env_steps == 120 and loaded.config == resolved(config)
+    assert srl_jax.load(path / "best").act(np.zeros((2, 42, 42, 4), np.uint8)).shape == (2,)
+    assert srl_jax.load(path / "encoders").env_steps == 60
+    before = sorted(path.rglob("*"))
+    with pytest.raises(ConfigError, match=f"^{path}: not an empty directory; name a new one"):
+        srl_jax.train(config, path)
+    assert sorted(path.rglob("*")) == before
+
+
+@pytest.mark.parametrize(
+    "values, message",
+    [
+        ({"mode": "frozen"}, "--encoder_from: --mode=frozen needs"),
+        ({"rl": "rainboww"}, "--rl=rainboww: no 'rainboww'; did you mean rainbow"),
+        ({"rl": "c51:n_step=0"}, "--rl=c51:n_step=0: n_step must be at least 1"),
+        ({"game": "no_module_here:Game-v0"}, "--game=no_module_here:Game-v0: "),
+        ({"mode": "frozen", "encoder_from": "nowhere"}, "--encoder_from=nowhere: "),
+        ({"buffer_size": 35, "learn_start": 8}, "--buffer_size=35: capacity must be at least 36"),
+    ],
+)
+def test_what_cannot_be_run_is_refused_and_leaves_nothing(values, message, tmp_path):
+    with pytest.raises(ConfigError, match=f"^{message}"):
+        srl_jax.train(Config(**{**SMALL, **values}), tmp_path / "runs" / "x", progress=False)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_file_is_no_place_for_a_run(tmp_path):
+    (tmp_path / "x").write_text("mine")
+    with pytest.raises(ConfigError, match="not an empty directory"):
+        srl_jax.train(Config(**SMALL), tmp_path / "x")
+    assert (tmp_path / "x").read_text() == "mine"
