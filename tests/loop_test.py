@@ -475,7 +475,7 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
     for flag in ("policy_from", "encoder_from"):
         grey = Config(**{**SMALL, "mode": "pretrain", "objectives": ("latent_l2",), flag: str(path)})
         with pytest.raises(ConfigError, match=rf"--{flag}=.* of \[42, 50, 3\], Catch shows \[42, 42, 1\]"):
-            loop.Run(grey, tmp_path, progress=False)
+            one_run(grey, tmp_path)
 
 
 def test_early_stop(tmp_path):
