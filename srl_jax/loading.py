@@ -176,13 +176,13 @@ def given_policy(
     return loaded.policy
 
 
-def initial_params(config: Config, frame_shape: tuple, template: dict[str, Params]) -> dict[str, Params]:
+def initial_params(config: Config, frame_shape: tuple, agent: Agent) -> dict[str, Params]:
     """{group: tree} of what starts from `encoder_from`: the encoder, and heads as `heads_from` says.
 
     Args:
         config: of the run.
         frame_shape: (H, W, C) of its environments.
-        template: parameters, or their shapes, of its agent.
+        agent: of the configuration.
 
     Raises:
         srl_jax.errors.ConfigError: it cannot be loaded or does not fit.
@@ -191,7 +191,7 @@ def initial_params(config: Config, frame_shape: tuple, template: dict[str, Param
         return {}
     manifest = checkpoint.read_manifest(config.encoder_from)
     checkpoint.check_frames(manifest, frame_shape, f"--encoder_from={config.encoder_from}", config.game)
-    found = checkpoint.load(manifest)
+    found, template = checkpoint.load(manifest), agent.shapes().params
     wanted = {"representation": template.keys() - {RL}, "all": template.keys(), "none": {ENCODER}}
     names = sorted(wanted[config.heads_from] & found.keys())
     hint = "" if config.heads_from == "none" else " (--heads_from=none starts from the encoder alone)"

@@ -158,7 +158,7 @@ class Run:
         self.left = False  # nobody waits for the evaluation under way
         self.resumed = resume is not None
         if resume is None:
-            start = initial_params(config, frame, self.agent.shapes().params)
+            start = initial_params(config, frame, self.agent)
             states = [self.agent.init(seed.key, start) for seed in self.seeds]
         else:
             states = list(self.env_threads.map(Seed.restore, self.seeds, resume))
