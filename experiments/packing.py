@@ -18,7 +18,7 @@ from typing import Any
 from absl import flags
 
 from srl_jax import ending
-from srl_jax.config import Config
+from srl_jax.config import INFOS, Config
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import parse_row
@@ -38,6 +38,7 @@ CONFIGS = "configs.json"
 ROWS = "rows.jsonl.gz"
 """A row a line, {"game", "arm", "seed", and what metrics.jsonl has}: a run's rows follow each other."""
 KEYS = ("game", "arm", "seed")
+FIELDS = {name: place for place, name in enumerate(INFOS)}
 OWN = ("seed", "started", "continued")
 """The fields of config.json that are a run's own, even where an arm has a single run."""
 
@@ -56,15 +57,19 @@ def folders_below(root: Path) -> list[Path]:
     return runs_below(root, CONFIGS)
 
 
-def read(folder: Path) -> list[RunData]:
+def read(folder: Path, *, only_last: bool = False) -> list[RunData]:
     """Reads packed runs, as `run_data.load_run` gives them from their directories.
+
+    Args:
+        folder: that they are packed in.
+        only_last: whether to read the last row of each run alone, which is ten times as fast.
 
     Raises:
         ConfigError: a file cannot be read, or is not what `write` writes.
     """
-    rows = _rows(folder / ROWS)
+    entries, rows = _entries(folder), _rows(folder / ROWS, only_last)
     runs = []
-    for arm, about, run in _entries(folder):
+    for arm, about, run in entries:
         path = folder / CONFIGS
         try:
             config = Config.from_json(json.dumps(about))
@@ -205,21 +210,26 @@ def _sorted(runs: Iterable[RunData]) -> list[RunData]:
 
 def _arm(folder: Path, runs: Sequence[RunData]) -> dict[str, Any]:
     """The entry of an arm on a game in configs.json."""
-    first = runs[0].about
-    texts = [{name: json.dumps(value) for name, value in run.about.items()} for run in runs]
-    shared = [name for name in first if name not in OWN and len({text.get(name) for text in texts}) == 1]
+    abouts = [{name: run.about[name] for name in sorted(run.about, key=_place)} for run in runs]
+    texts = [{name: json.dumps(value) for name, value in about.items()} for about in abouts]
+    shared = [name for name in abouts[0] if name not in OWN and len({text.get(name) for text in texts}) == 1]
     return {
         "arm": runs[0].arm,
-        "config": {name: first[name] for name in shared},
+        "config": {name: abouts[0][name] for name in shared},
         "runs": [
             {
                 "path": run.path.relative_to(folder).as_posix(),
-                "config": {name: value for name, value in run.about.items() if name not in shared},
+                "config": {name: value for name, value in about.items() if name not in shared},
                 "ended": run.ended and run.ended._asdict(),
             }
-            for run in runs
+            for run, about in zip(runs, abouts, strict=True)
         ],
     }
+
+
+def _place(name: str) -> tuple[int, str]:
+    """A key for sorting what config.json holds: the fields of Config in their order, then the others."""
+    return FIELDS.get(name, len(FIELDS)), name
 
 
 def _entries(folder: Path) -> list[tuple[str, dict[str, Any], Mapping[str, Any]]]:
@@ -234,7 +244,7 @@ def _entries(folder: Path) -> list[tuple[str, dict[str, Any], Mapping[str, Any]]
         raise ConfigError(f"{path}: not what packing writes ({error})") from None
 
 
-def _rows(path: Path) -> dict[tuple[str, str, int], list[dict[str, Any]]]:
+def _rows(path: Path, only_last: bool) -> dict[tuple[str, str, int], list[dict[str, Any]]]:
     """{(game, arm, seed): its rows, as metrics.jsonl has them}."""
     found: dict[tuple, list[dict[str, Any]]] = {}
     try:
@@ -243,7 +253,10 @@ def _rows(path: Path) -> dict[tuple[str, str, int], list[dict[str, Any]]]:
         raise ConfigError(f"{path}: damaged ({error})") from None
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    for number, line in enumerate(lines, 1):
+    runs = [line.partition(b', "kind"')[0] for line in lines]
+    for number, (line, run, after) in enumerate(zip(lines, runs, [*runs[1:], b""], strict=True), 1):
+        if only_last and run == after:
+            continue
         try:
             row = parse_row(line)
             key = tuple(row.pop(name) for name in KEYS)

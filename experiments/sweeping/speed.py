@@ -137,7 +137,7 @@ class Speeds:
 def _published(results: Path) -> Iterable[tuple[Progress, Config]]:
     for folder in packing.folders_below(results):
         try:
-            yield from ((progress_of(run.rows), run.config) for run in packing.read(folder))
+            yield from ((progress_of(run.rows), run.config) for run in packing.read(folder, only_last=True))
         except ConfigError:
             continue
 
