@@ -4,7 +4,7 @@ Two files take the place of a directory for each run. configs.json has a configu
 game, and what is each run's own. rows.jsonl.gz has the rows of all runs, each with its game, arm and seed:
 `pandas.read_json("rows.jsonl.gz", lines=True)`. Figures and reports read such a folder as they read run
 directories. Whatever else lies in the folder stays, and runs of other seeds, arms and games can be added
-later. `--unpack` makes the run directories again.
+later; a run that is under way is left out. `--unpack` makes the run directories again.
 """
 
 import gzip
@@ -17,7 +17,7 @@ from typing import Any
 
 from absl import flags
 
-from srl_jax import ending
+from srl_jax import display, ending
 from srl_jax.config import INFOS, Config
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
@@ -145,15 +145,17 @@ def added(here: Sequence[RunData], more: Iterable[RunData]) -> list[RunData]:
     return list(runs.values())
 
 
-def pack(root: Path, folder: Path) -> tuple[int, int]:
+def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     """Adds the runs in or below a directory to those that are packed in a folder.
+
+    A run that is under way, or was killed, is left out: it may still get other rows.
 
     Args:
         root: a run keeps its path below it.
         folder: made if it is not there.
 
     Returns:
-        How many runs were added, and how many there are.
+        How many runs were added, how many there are, and the directories of those that were left out.
 
     Raises:
         ConfigError: there is no run, or see `added`, `read` and `run_data.load_run`; nothing was written.
@@ -163,11 +165,11 @@ def pack(root: Path, folder: Path) -> tuple[int, int]:
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
     here = read(folder) if is_packed(folder) else []
-    moved = [run._replace(path=folder / run.path.relative_to(root)) for run in added([], found)]
-    runs = added(here, moved)
+    whole = added([], (run for run in found if _is_over(run)))
+    runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
-    return len(runs) - len(here), len(runs)
+    return len(runs) - len(here), len(runs), [run.path for run in found if not _is_over(run)]
 
 
 def unpack(folder: Path, root: Path) -> int:
@@ -194,6 +196,11 @@ def unpack(folder: Path, root: Path) -> int:
         if run.ended is not None:
             ending.write(path, run.ended)
     return len(runs)
+
+
+def _is_over(run: RunData) -> bool:
+    """Whether a run says how it ended, or has all its env steps: earlier versions wrote no ended.json."""
+    return run.ended is not None or bool(run.rows) and run.rows[-1]["env_steps"] >= run.config.steps
 
 
 def _key(run: RunData) -> tuple[str, str, int]:
@@ -288,7 +295,9 @@ def main(argv: list[str]) -> None:
         if FLAGS.unpack:
             print(f"{out}: {unpack(runs, out)} runs unpacked")
         else:
-            more, count = pack(runs, out)
+            more, count, left_out = pack(runs, out)
+            for path in left_out:
+                display.say(f"{path}: left out: it is under way, or was killed and can be resumed")
             print(f"{out}: {more} runs added, {count} in all")
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error

@@ -29,9 +29,8 @@ def root(tmp_path):
             root / f"Catch/rl_only_nature/seed{seed}", returns, seed=seed, ended=Ending("finished", 200)
         )
         source = f"Catch/pretrain_256/seed{seed}"
-        write_run(
-            root / f"Catch/joint_256/seed{seed}", (0, 1, 0), seed=seed, mode="joint", encoder_from=source
-        )
+        values = {"seed": seed, "mode": "joint", "encoder_from": source, "steps": 200}
+        write_run(root / f"Catch/joint_256/seed{seed}", (0, 1, 0), **values)
     write_run(root / "alone_seed10", (0, 1), seed=10, ended=NOT_FINITE)
     return root
 
@@ -59,7 +58,7 @@ def test_a_packed_run_is_the_run(root, tmp_path):
     beside.write_text(json.dumps(json.loads(beside.read_text()) | {"gamma": 1.0}))
     with open(root / "alone_seed10/metrics.jsonl", "a") as file:
         file.write(json.dumps(ROW) + "\n")
-    assert packing.pack(root, tmp_path / "out") == (5, 5)
+    assert packing.pack(root, tmp_path / "out") == (5, 5, [])
     runs = collect.load_runs(root)
     packed = collect.load_runs(tmp_path / "out")
     assert _told(packed) == _told(runs)
@@ -100,23 +99,24 @@ def test_runs_are_added_in_any_order_to_the_same_bytes(root, tmp_path):
     packing.pack(root, tmp_path / "all")
     late = root / "Catch/joint_256/seed0"
     late.rename(tmp_path / "late")
-    assert packing.pack(root, tmp_path / "some") == (4, 4)
+    assert packing.pack(root, tmp_path / "some") == (4, 4, [])
     some = {path.name: path.read_bytes() for path in (tmp_path / "some").iterdir()}
     (tmp_path / "some/README.md").write_text("Why?")
     (tmp_path / "late").rename(late)
-    assert packing.pack(root, tmp_path / "some") == (1, 5)
+    assert packing.pack(root, tmp_path / "some") == (1, 5, [])
     for name in (packing.CONFIGS, packing.ROWS):
         assert (tmp_path / "some" / name).read_bytes() == (tmp_path / "all" / name).read_bytes() != some[name]
-    assert packing.pack(root, tmp_path / "some") == (0, 5)
+    assert packing.pack(root, tmp_path / "some") == (0, 5, [])
     assert sorted(path.name for path in (tmp_path / "some").iterdir()) == ["README.md", *sorted(some)]
 
 
 def test_a_run_that_is_there_with_other_rows_or_settings_is_refused(root, tmp_path):
     packing.pack(root, tmp_path / "out")
     there = {path: path.read_bytes() for path in (tmp_path / "out").iterdir()}
-    write_run(tmp_path / "rows/Catch/joint_256/seed5", seed=5)
-    write_run(tmp_path / "rows/Catch/rl_only_nature/seed0", (-1, 0, 2))
-    write_run(tmp_path / "settings/Catch/rl_only_nature/seed0", (-1, 0, 1), gamma=0.9)
+    over = Ending("finished", 200)
+    write_run(tmp_path / "rows/Catch/joint_256/seed5", seed=5, ended=over)
+    write_run(tmp_path / "rows/Catch/rl_only_nature/seed0", (-1, 0, 2), ended=over)
+    write_run(tmp_path / "settings/Catch/rl_only_nature/seed0", (-1, 0, 1), gamma=0.9, ended=over)
     for what in ("rows", "settings"):
         with pytest.raises(ConfigError, match=f"Catch, rl_only_nature, seed 0 is there with other {what}"):
             packing.pack(tmp_path / what, tmp_path / "out")
@@ -148,6 +148,12 @@ def test_what_packing_did_not_write_is_refused(root, tmp_path):
     (out / packing.ROWS).unlink()
     with pytest.raises(ConfigError, match="rows.jsonl.gz: No such file"):
         packing.read(out)
+
+
+def test_a_run_that_may_get_more_rows_is_left_out(root, tmp_path):
+    part = write_run(root / "Catch/joint_256/seed2", (0, 1), seed=2, mode="joint", steps=200)
+    none = write_run(root / "Catch/joint_256/seed3", (), seed=3, mode="joint", steps=200)
+    assert packing.pack(root, tmp_path / "out") == (5, 5, [part, none])
 
 
 def test_a_row_that_has_a_key_of_packing_is_refused(root, tmp_path):
