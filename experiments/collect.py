@@ -1,25 +1,23 @@
 """Runs read from disk, grouped by game and arm, and what may be compared with what.
 
 The layout is ROOT/GAME/ARM/seedN/; a run directory that lies elsewhere is an arm of its own name. A link to a
-run has the link's name. Imports no jax.
+run has the link's name. Runs may be packed, see `packing`. Imports no jax.
 """
 
 import os
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
-from srl_jax import ending, statistics
-from srl_jax.config import INFOS, Config, difference
-from srl_jax.ending import Ending
+from srl_jax import statistics
+from srl_jax.config import INFOS, difference
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 
-from .directories import natural, runs_below
-from .draw import read_rows
+from . import packing
+from .directories import natural
+from .run_data import RunData, arm_name, load_run, run_directories
 
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
@@ -28,83 +26,64 @@ OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports")
 """Fields in which runs of one arm and game may differ."""
 
 
-class RunData(NamedTuple):
-    """One run, finished or not.
-
-    Attributes:
-        path: of the run directory.
-        game, arm, seed: what it is a run of.
-        config: its config.json.
-        rows: of its metrics.jsonl; none if it has not begun.
-        ended: how, or None: it is under way, or was killed, or is of before that was written.
-    """
-
-    path: Path
-    game: str
-    arm: str
-    seed: int
-    config: Config
-    rows: list[dict]
-    ended: Ending | None = None
-
-    @property
-    def failed(self) -> bool:
-        """Whether it ended with an error, and is not under way."""
-        return self.ended is not None and self.ended.failed
-
-
-def arm_name(path: Path) -> str:
-    """The arm of a run directory: its parent's name if it is called seedN, else its own without _seedN."""
-    path = Path(os.path.abspath(path))  # of ".", too
-    if re.fullmatch(r"seed\d+", path.name):
-        return path.parent.name
-    return re.sub(r"_seed\d+$", "", path.name)
-
-
-def load_run(path: Path) -> RunData:
-    """Reads a run directory.
-
-    Raises:
-        ConfigError: it is none, or what it holds is not what training writes.
-    """
-    config = Config.load(path)
-    metrics = path / "metrics.jsonl"
-    rows = read_rows(metrics) if metrics.exists() else []
-    return RunData(path, config.game, arm_name(path), config.seed, config, rows, ending.read(path))
-
-
 def load_runs(*roots: str | Path) -> list[RunData]:
-    """All runs in or below directories, by game, arm and seed; links are followed, each run is read once.
+    """All runs in or below directories, by game, arm and seed: those of run directories, and packed ones.
+
+    Links are followed, and each run is read once.
 
     What was moved aside as broken does not count.
 
     Raises:
         ConfigError: in one there is none, one cannot be read, or two are of the same game, arm and seed.
     """
-    paths: dict[str, Path] = {}
+    files: dict[str, Path] = {}
     for root in map(Path, roots):
-        kept = _directories(root)
-        if not kept:
-            raise ConfigError(f"{root}: no run directory there (none has a config.json)")
-        for path in kept:
-            paths.setdefault(os.path.realpath(path), path)
-    runs: dict[tuple, RunData] = {}
-    for path in paths.values():
-        run = load_run(path)
-        other = runs.setdefault((run.game, run.arm, run.seed), run)
-        if other is not run:
-            raise ConfigError(f"{path}: the same game, arm and seed as {other.path}; move one of them away")
+        found = [path / "config.json" for path in run_directories(root)]
+        found += [folder / packing.CONFIGS for folder in packing.folders_below(root)]
+        if not found:
+            raise ConfigError(f"{root}: no run directory there (none has a config.json), and no packed run")
+        for path in found:
+            files.setdefault(os.path.realpath(path), path)
+    read: list[RunData] = []
+    for path in files.values():
+        read += packing.read(path.parent) if path.name == packing.CONFIGS else [load_run(path.parent)]
+    runs = _each_once(read)
     return [runs[key] for key in sorted(runs, key=lambda key: (key[0], natural(key[1]), key[2]))]
 
 
+def load_named(root: Path, names: Iterable[str]) -> list[RunData]:
+    """The runs at places below a directory: in a directory there, or packed in the root. Others are not read.
+
+    Args:
+        root: the directory.
+        names: of the places, GAME/ARM/seedN. Where there is no run, there is none in the result.
+
+    Raises:
+        ConfigError: one cannot be read, or is there in both forms.
+    """
+    places = [root / name for name in names]
+    found = [load_run(path) for path in places if (path / "config.json").exists()]
+    if packing.is_packed(root):
+        found += [run for run in packing.read(root) if run.path in places]
+    return sorted(_each_once(found).values(), key=lambda run: places.index(run.path))
+
+
+def _each_once(runs: Iterable[RunData]) -> dict[tuple, RunData]:
+    """{(game, arm, seed): the run}."""
+    found: dict[tuple, RunData] = {}
+    for run in runs:
+        other = found.setdefault((run.game, run.arm, run.seed), run)
+        if other is not run:
+            raise ConfigError(
+                f"{run.path}: the same game, arm and seed as {other.path}; move one of them away"
+            )
+    return found
+
+
 def arm_names(root: Path) -> list[str]:
-    """The arms of all runs in or below a directory, which are not read."""
-    return sorted({arm_name(path) for path in _directories(root)})
-
-
-def _directories(root: Path) -> list[Path]:
-    below = runs_below(root)
-    return [path for path in below if not any(".broken-" in part for part in path.relative_to(root).parts)]
+    """The arms of all runs in or below a directory, whose rows are not read."""
+    names = {arm_name(path) for path in run_directories(root)}
+    return sorted(names.union(*(packing.arms(folder) for folder in packing.folders_below(root))))
 
 
 def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:

@@ -21,8 +21,10 @@ def say(line: str) -> None:
     display.say(f"resume: {line}")
 
 
-def runs_below(root: Path) -> list[Path]:
-    """Directories with a config.json in or below another; links are followed: a run may lie elsewhere.
+def runs_below(root: Path, file: str = "config.json") -> list[Path]:
+    """Directories with a config.json, or another file, in or below a directory.
+
+    Links are followed: a run may lie elsewhere.
 
     Each is found once: by its own path where that is below, else by the first link to it. A link to what the
     link or the root lies in is not followed.
@@ -50,7 +52,7 @@ def runs_below(root: Path) -> list[Path]:
                     folders.clear()
                     continue
                 seen.add(real)
-                if "config.json" in files and os.path.isfile(os.path.join(folder, "config.json")):
+                if file in files and os.path.isfile(os.path.join(folder, file)):
                     found.append(folder)
                 paths = [os.path.join(folder, name) for name in folders]
                 links += [path for path in paths if os.path.islink(path) and not _around(path, real, root)]

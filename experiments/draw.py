@@ -89,11 +89,25 @@ def read_rows(path: Path) -> list[dict]:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except ValueError as error:
         raise ConfigError(str(error)) from None
+    check_rows(rows, str(path))
+    return rows
+
+
+def check_rows(rows: list[dict], name: str) -> None:
+    """Whether what is drawn of rows is what training writes.
+
+    Args:
+        rows: as `read_metrics` gives them.
+        name: what they are the rows of, for errors.
+
+    Raises:
+        ConfigError: it is something else; one line.
+    """
     for number, row in enumerate(rows, 1):
         if row.get("kind") not in KINDS:
-            raise ConfigError(f"{path}, line {number}: kind is none of {', '.join(KINDS)}")
+            raise ConfigError(f"{name}, line {number}: kind is none of {', '.join(KINDS)}")
         if not _is_count(row.get("env_steps")):
-            raise ConfigError(f"{path}, line {number}: env_steps is no count")
+            raise ConfigError(f"{name}, line {number}: env_steps is no count")
         for key, value in row.items():
             if key == "eval/returns":
                 good = isinstance(value, list) and all(map(_is_number, value))
@@ -105,13 +119,12 @@ def read_rows(path: Path) -> list[dict]:
                 drawn = key == "eval/return_mean" or key.split("/")[0] in ("loss", "grad_norm")
                 good = not drawn or _is_number(value)
             if not good:
-                raise ConfigError(f"{path}, line {number}: {key} is not made of numbers of single precision")
-    for name in drift_names(rows):
+                raise ConfigError(f"{name}, line {number}: {key} is not made of numbers of single precision")
+    for kind in drift_names(rows):
         try:
-            drift_matrix(rows, name)
+            drift_matrix(rows, kind)
         except ValueError as error:
-            raise ConfigError(f"{path}: {error}") from None
-    return rows
+            raise ConfigError(f"{name}: {error}") from None
 
 
 def _is_count(value: Any) -> bool:

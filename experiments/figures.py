@@ -24,7 +24,7 @@ from srl_jax.data import published, reference_policies
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
 
-from . import collect, curves, plots, sweep
+from . import collect, curves, packing, plots, sweep
 from . import flags as config_flags
 from .arms import FIGURES, Figure, figures_named
 from .collect import RunData, comparable, steps_and_returns
@@ -265,6 +265,10 @@ def run(values: flags.FlagValues) -> int:
     figures = figures_named(values["figure"].value)
     out = values["out"].value
     root = config_flags.check_place("out", out)
+    if packing.is_packed(root) and not values["redraw"].value:
+        raise ConfigError(
+            f"--out={out}: its runs are packed; draw them with --redraw, or name another directory"
+        )
     options = sweep.launcher_options(values)
     seeds, games = (
         parse_seeds(values["seeds"].value),
@@ -284,8 +288,7 @@ def run(values: flags.FlagValues) -> int:
             status = sweep.run_sweep(root, runs, **options).status
             if status >= 128:  # told to end
                 return status
-        here = [root / run.name for run in runs if (root / run.name / "config.json").exists()]
-        read = [collect.load_run(path) for path in here]
+        read = collect.load_named(root, [run.name for run in runs])
         how = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
         for figure in figures:
             print(write(figure, read, games, root / "figures", **how))

@@ -325,8 +325,7 @@ def main(argv: list[str]) -> int:
     try:
         outcome = run_sweep(root, runs, **options)
         if outcome.status < 128:  # not told to end
-            here = [root / run.name for run in runs if (root / run.name / "config.json").exists()]
-            if lines := best.lines([collect.load_run(path) for path in here]):
+            if lines := best.lines(collect.load_named(root, [run.name for run in runs])):
                 display.result("\n".join(lines))
     except OSError as error:
         raise SaveError(f"--out={FLAGS.out}: {error.strerror or error}") from error

@@ -154,7 +154,7 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
     for number, line in enumerate(lines, 1):
         try:
             if number < len(lines) or line:
-                rows.append(_parse(line))
+                rows.append(parse_row(line))
         except ValueError as error:
             if number < len(lines):
                 raise ValueError(f"{path}, line {number}: {error}") from None
@@ -166,7 +166,13 @@ def strip_wall(row: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in row.items() if not key.startswith("wall_")}
 
 
-def _parse(line: bytes) -> dict[str, Any]:
+def parse_row(line: bytes) -> dict[str, Any]:
+    """Reads one line of a metrics.jsonl.
+
+    Raises:
+        ValueError: it is not a JSON object, or has a NaN or an infinity.
+    """
+
     def refuse(name):
         raise ValueError(f"{name} is not JSON")
 
@@ -199,7 +205,7 @@ def _mend(path: Path) -> None:
         if whole == len(data):
             return
         try:
-            _parse(data[whole:])
+            parse_row(data[whole:])
             file.write(b"\n")
         except ValueError:
             file.truncate(whole)

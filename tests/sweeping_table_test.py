@@ -7,6 +7,7 @@ import pathlib
 
 import pytest
 
+from experiments import packing
 from experiments.sweeping import speed, table
 from experiments.sweeping.launching import View
 from experiments.sweeping.manifest import Entry
@@ -76,7 +77,7 @@ def test_speeds_are_of_like_runs(tmp_path):
     assert speeds.of(third) == (1800 / 31, "runs of this sweep, of other settings")
     assert speeds.of(dataclasses.replace(CONFIG, encoder="sac_ae:features=50")) is None
     # Published runs count where the sweep's own do not.
-    published = Config.load(speed.RESULTS / "catch" / "rl_only_seed0")
+    published = packing.read(speed.RESULTS / "catch")[-1].config
     found = Speeds(tmp_path, runs.values()).of(dataclasses.replace(published, seed=99))
     assert found.source == "published runs, on their machine" and 100 < found.per_s < 5000
 

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 from srl_jax import envs, specs
 from srl_jax.config import INFOS, Config, history
 from srl_jax.errors import ConfigError
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
 from .. import collect
 from ..collect import RunData
@@ -47,21 +46,19 @@ class Differences(NamedTuple):
 
 
 def about(run: RunData) -> About:
-    """Reads the rest of a run's config.json.
+    """Reads what a run's config.json holds beside its settings.
 
     Raises:
         ConfigError: it is not what training writes.
     """
-    path = run.path / "config.json"
     try:
-        values = parse_json(read_bytes(path, SETTINGS))
-        past = {name: said for name, found in history(values).items() if (said := _in_turn(found))}
-        pairs = tuple((str(name), past.get(name, "")) for name in values.get("versions") or {})
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        past = {name: said for name, found in history(run.about).items() if (said := _in_turn(found))}
+        pairs = tuple((str(name), past.get(name, "")) for name in run.about.get("versions") or {})
     except (ValueError, TypeError, KeyError, AttributeError) as error:
-        raise ConfigError(f"{path}: {error}") from None
-    return About(past.get("git_revision", ""), str(values.get("started") or ""), past.get("cpus", ""), pairs)
+        raise ConfigError(f"{run.path / 'config.json'}: {error}") from None
+    return About(
+        past.get("git_revision", ""), str(run.about.get("started") or ""), past.get("cpus", ""), pairs
+    )
 
 
 def _in_turn(found: Sequence[Any]) -> str:

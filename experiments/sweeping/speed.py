@@ -7,7 +7,7 @@ them.
 import json
 import os
 from collections import defaultdict
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,7 +15,7 @@ from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 
-from ..directories import runs_below
+from .. import packing
 from .manifest import Entry
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
@@ -70,7 +70,11 @@ def last_rows(path: Path, tail: int = TAIL) -> list[dict[str, Any]]:
 
 def progress(run: Path, tail: int = TAIL) -> Progress:
     """How far the run in a directory is, from its last rows: those in so many bytes."""
-    rows = last_rows(run / "metrics.jsonl", tail)
+    return progress_of(last_rows(run / "metrics.jsonl", tail))
+
+
+def progress_of(rows: Sequence[Mapping[str, Any]]) -> Progress:
+    """How far a run is, from its last rows."""
     if not rows:
         return Progress()
     returns = [row.get("eval/return_mean") for row in rows if row.get("kind") == "eval"]
@@ -95,12 +99,15 @@ class Speeds:
     Args:
         root: of the sweep.
         entries: of its manifest.
-        results: a directory with run directories in it.
+        results: a directory with packed runs below it.
     """
 
     def __init__(self, root: Path, entries: Iterable[Entry], results: Path = RESULTS):
         self.tables = [
-            (self._table((root / run.name, config) for run, config in entries), "runs of this sweep")
+            (
+                self._table((progress(root / run.name, 1 << 15), config) for run, config in entries),
+                "runs of this sweep",
+            )
         ]
         self.results = results
 
@@ -115,11 +122,10 @@ class Speeds:
         return None
 
     @staticmethod
-    def _table(runs: Iterable[tuple[Path, Config]]) -> dict[tuple, tuple[float, float]]:
+    def _table(runs: Iterable[tuple[Progress, Config]]) -> dict[tuple, tuple[float, float]]:
         """{key: (env steps, seconds)}, summed over the runs."""
         table: dict[tuple, tuple[float, float]] = defaultdict(lambda: (0.0, 0.0))
-        for path, config in runs:
-            got = progress(path, 1 << 15)
+        for got, config in runs:
             if got.seconds <= 0 or got.env_steps <= 2 * config.learn_start:
                 continue
             for key in keys(config):
@@ -128,10 +134,10 @@ class Speeds:
         return dict(table)
 
 
-def _published(results: Path) -> Iterable[tuple[Path, Config]]:
-    for path in runs_below(results):
+def _published(results: Path) -> Iterable[tuple[Progress, Config]]:
+    for folder in packing.folders_below(results):
         try:
-            yield path, Config.load(path)
+            yield from ((progress_of(run.rows), run.config) for run in packing.read(folder, only_last=True))
         except ConfigError:
             continue
 
