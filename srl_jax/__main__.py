@@ -8,9 +8,10 @@ from pathlib import Path
 def main() -> None:
     """Runs a command of `experiments.cli`, which an installation has as `srl_jax.experiments.cli`."""
     here = Path(__file__).resolve().parent
-    installed = importlib.util.find_spec("srl_jax.experiments")
+    spec = importlib.util.find_spec("srl_jax.experiments")
+    installed = spec.origin if spec else None
     # Where a checkout is run that is not the one that is installed, its own commands are meant.
-    ours = installed and Path(installed.origin).resolve().parents[1] in (here, here.parent)
+    ours = installed and Path(installed).resolve().parents[1] in (here, here.parent)
     importlib.import_module(f"{'srl_jax.' if ours else ''}experiments.cli").main()
 
 

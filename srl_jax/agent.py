@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Collection, Mapping, Sequence
-from typing import Any, NamedTuple, Protocol, cast
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -48,61 +48,60 @@ class Act(Protocol):
     ) -> jax.Array: ...
 
 
-class Update(Protocol):
-    """The type of `Agent.update`; its attributes are those of `jit_update`."""
-
-    pure: Callable
-    compiled: Callable
-    lifted: Callable[[Callable[[Callable], Callable]], "Update"]
-
-    def __call__(
-        self, state: TrainState, window: Window, hyper: Hyper, /
-    ) -> tuple[TrainState, jax.Array | None, dict[str, jax.Array]]: ...
-
-
-def jit_update(
-    update: Callable, plan: Sequence[Pass], lift: Callable[[Callable], Callable] = lambda change: change
-) -> Update:
-    """Jits an update, (state, window, hyper) -> (state, td_error, metrics), so that nothing is copied.
+class Update:
+    """A jitted update, (state, window, hyper) -> (state, td_error, metrics), that copies nothing.
 
     The optimizer's state of the groups that move is taken over. Parameters are not: they may still act. What
     does not change is no result of the compiled function, for XLA would copy it.
 
     Args:
-        update: from `make_update`; the result has it as `pure`, and the jitted function as `compiled`.
+        pure: from `make_update`.
         plan: its passes.
         lift: from the function that is jitted, (opt_state, params, rest, window, hyper) -> (what moved,
             td_error, metrics), to another one: see `over_seeds`.
-    """
-    params = {group for one in plan for group in one.groups}
-    opt_state = {moments for one in plan for moments in one.groups.values()}
 
-    def part(state: TrainState, moves: bool) -> tuple[dict, dict]:
+    Attributes:
+        pure: as given.
+        compiled: the jitted function.
+    """
+
+    def __init__(
+        self,
+        pure: Callable,
+        plan: Sequence[Pass],
+        lift: Callable[[Callable], Callable] = lambda change: change,
+    ):
+        self.pure, self._plan = pure, plan
+        self._params = {group for one in plan for group in one.groups}
+        self._opt_state = {moments for one in plan for moments in one.groups.values()}
+        self.compiled = jax.jit(lift(self._change), donate_argnums=0)
+
+    def lifted(self, lift: Callable[[Callable], Callable]) -> "Update":
+        """The same update with another `lift`."""
+        return Update(self.pure, self._plan, lift)
+
+    def __call__(
+        self, state: TrainState, window: Window, hyper: Hyper, /
+    ) -> tuple[TrainState, jax.Array | None, dict[str, jax.Array]]:
+        opt_state, params = self._part(state, False)
+        rest = state._replace(opt_state=opt_state, params=params)
+        (*moved, step), td_error, metrics = self.compiled(*self._part(state, True), rest, window, hyper)
+        return _put(state, *moved)._replace(step=step), td_error, metrics
+
+    def _change(self, opt_state: dict, params: dict, rest: TrainState, window: Window, hyper: Hyper):
+        new, td_error, metrics = self.pure(_put(rest, opt_state, params), window, hyper)
+        return (*self._part(new, True), new.step), td_error, metrics
+
+    def _part(self, state: TrainState, moves: bool) -> tuple[dict, dict]:
         """Of the optimizer's state and the parameters, the groups that move, or those that do not."""
-        return tuple(
-            {group: x for group, x in tree.items() if (group in groups) == moves}
-            for tree, groups in ((state.opt_state, opt_state), (state.params, params))
+        return (
+            {group: x for group, x in state.opt_state.items() if (group in self._opt_state) == moves},
+            {group: x for group, x in state.params.items() if (group in self._params) == moves},
         )
 
-    def put(state: TrainState, moved: tuple[dict, dict]) -> TrainState:
-        return state._replace(opt_state=state.opt_state | moved[0], params=state.params | moved[1])
 
-    def change(opt_state: dict, params: dict, rest: TrainState, window: Window, hyper: Hyper):
-        new, td_error, metrics = update(put(rest, (opt_state, params)), window, hyper)
-        return (*part(new, True), new.step), td_error, metrics
-
-    compiled = jax.jit(lift(change), donate_argnums=0)
-
-    def jitted(state: TrainState, window: Window, hyper: Hyper):
-        still = part(state, False)
-        rest = state._replace(opt_state=still[0], params=still[1])
-        (*moved, step), td_error, metrics = compiled(*part(state, True), rest, window, hyper)
-        return put(state, moved)._replace(step=step), td_error, metrics
-
-    result = cast(Update, jitted)
-    result.pure, result.compiled = update, compiled
-    result.lifted = lambda lift: jit_update(update, plan, lift)
-    return result
+def _put(state: TrainState, opt_state: dict, params: dict) -> TrainState:
+    return state._replace(opt_state=state.opt_state | opt_state, params=state.params | params)
 
 
 class Agent(NamedTuple):
@@ -194,7 +193,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
             slow_follows=False,
         )
         plan = passes(mode, [name for name in terms if name in only], config.encoder_optimizer)
-        return jit_update(update, plan)
+        return Update(update, plan)
 
     def jitted_act(noisy: bool) -> Act:
         act = make_act(encoder, algorithm.q_values, noisy=noisy)

@@ -120,7 +120,7 @@ def save(
             shutil.rmtree(left)
         temporary.mkdir()
         files = _write_files(temporary, params, state, base)
-        manifest = Manifest(final, config, tuple(frame_shape), num_actions, env_steps, updates, files)
+        manifest = Manifest(final, config, frame_shape, num_actions, env_steps, updates, files)
         sign(temporary, _about(manifest))
         _put_in_place(temporary, final)
         up_to_this = [p for p in _all(home) if int(p.name) <= env_steps]
@@ -159,7 +159,7 @@ def _write_files(folder: Path, params: Any, state: State | None, base: Manifest 
             array, header = np.asarray(array, order="C"), io.BytesIO()
             about = np.lib.format.header_data_from_array_1_0(array)
             np.lib.format.write_array_header_1_0(header, about)
-            files[file] = write(folder / file, header.getvalue(), array)
+            files[file] = write(folder / file, header.getvalue(), array.data)
     text = json.dumps(dict(state.numbers), allow_nan=False, indent=1)
     files[NUMBERS] = write(folder / NUMBERS, text.encode())
     return files
@@ -223,8 +223,8 @@ def _sum_line(digest: str) -> bytes:
     return f"{digest}  {MANIFEST}\n".encode()
 
 
-def write(path: Path, *pieces: bytes | np.ndarray) -> Entry:
-    """Writes a file from pieces, bytes or contiguous arrays, and flushes it to disk."""
+def write(path: Path, *pieces: bytes | memoryview) -> Entry:
+    """Writes a file from pieces, whose memory is contiguous, and flushes it to disk."""
     digest = hashlib.sha256()
     with open(path, "wb") as file:
         for piece in pieces:
@@ -267,9 +267,10 @@ def read_manifest(path: str | Path) -> Manifest:
         config = Config.from_json(json.dumps(about["config"]))
     except ConfigError as error:  # of another version
         raise ConfigError(f"{path / MANIFEST}: {error}") from None
-    counts = [about[name] for name in ("num_actions", "env_steps", "updates")]
+    counts = {name: about[name] for name in ("num_actions", "env_steps", "updates")}
+    height, width, channels = about["frame_shape"]
     files = {name: Entry(entry["bytes"], entry["sha256"]) for name, entry in about["files"].items()}
-    return Manifest(path, config, tuple(about["frame_shape"]), *counts, files)
+    return Manifest(path, config, (height, width, channels), files=files, **counts)
 
 
 def verify(manifest: Manifest) -> None:

@@ -344,14 +344,14 @@ def resolve(
 
 def unresolved(config: Config) -> Config:
     """The config with 0 where `resolve` would put the value that is there: it follows other fields again."""
-    defaults = {name: 0 for name in ("lr_encoder", "lr_encoder_srl", "checkpoint_every")}
+    defaults: dict[str, Any] = {name: 0 for name in ("lr_encoder", "lr_encoder_srl", "checkpoint_every")}
     bare = dataclasses.replace(config, **defaults)
     followed = {
         "lr_encoder": modes.encoder_learning_rate(bare),
         "lr_encoder_srl": modes.second_learning_rate(bare),
         "checkpoint_every": config.eval_every,
     }
-    same = {name: 0 for name, value in followed.items() if getattr(config, name) == value}
+    same: dict[str, Any] = {name: 0 for name, value in followed.items() if getattr(config, name) == value}
     return dataclasses.replace(config, **same)
 
 

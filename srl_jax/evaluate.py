@@ -57,7 +57,7 @@ def evaluate(
     stacks = FrameStack(number, stack, shape)
     frames, _ = env.reset(seed=seed)
     stacks.begin(frames)
-    scores = [[] for _ in range(number)]
+    scores: list[list[tuple[float, int]]] = [[] for _ in range(number)]
     share = [len(range(i, games, number)) for i in range(number)]
     score, length = np.zeros(number), np.zeros(number, int)
     recorded = [frames[0]][:record]

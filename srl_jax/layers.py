@@ -8,15 +8,17 @@ slower than the same layer written as a pad and a VALID convolution.
 import math
 from collections.abc import Sequence
 from functools import partial
+from typing import TypeAlias
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
-from srl_jax.types import Array
-
-Padding = str | int | tuple[tuple[int, int], tuple[int, int]]
+Pads: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
+"""Zeros around an image: ((above, below), (left, right))."""
+Padding: TypeAlias = str | int | Pads
 """See `Conv.padding`."""
 FEW_ROWS = 16
 """A noisy layer of no more rows multiplies by mu and by sigma, and does not write down their noisy sum."""
@@ -152,7 +154,7 @@ class Conv(nn.Module):
         return _valid_conv(x, kernel * self.gain, self.stride) + bias
 
 
-def padding_of(padding: Padding, sides: Sequence[int], kernel: int, stride: int) -> tuple:
+def padding_of(padding: Padding, sides: Sequence[int], kernel: int, stride: int) -> Pads:
     """The zeros ((above, below), (left, right)) that a `Conv.padding` means for an image of sides H and W.
 
     Raises:
@@ -161,10 +163,10 @@ def padding_of(padding: Padding, sides: Sequence[int], kernel: int, stride: int)
     if padding == "VALID":
         return (0, 0), (0, 0)
     if padding == "SAME":
-        missing = [max(0, (-(-side // stride) - 1) * stride + kernel - side) for side in sides]
-        return tuple((n // 2, n - n // 2) for n in missing)
-    pads = ((padding, padding),) * 2 if isinstance(padding, int) else tuple(map(tuple, padding))
-    if [len(pair) for pair in pads] != [2, 2] or min(map(min, pads)) < 0:
+        height, width = (max(0, (-(-side // stride) - 1) * stride + kernel - side) for side in sides)
+        return (height // 2, height - height // 2), (width // 2, width - width // 2)
+    pads = ((padding, padding), (padding, padding)) if isinstance(padding, int) else padding
+    if isinstance(pads, str) or [len(pair) for pair in pads] != [2, 2] or min(map(min, pads)) < 0:
         raise ValueError(f"padding must be VALID, SAME, a number or two pairs of numbers, not {padding!r}")
     return pads
 

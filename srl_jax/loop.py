@@ -169,8 +169,10 @@ class Run:
         with contextlib.ExitStack() as stack:
             for seed in self.seeds:
                 stack.callback(seed.close)
-            for entered in (*(seed.report for seed in self.seeds), self.env_threads, self.eval_threads):
-                stack.enter_context(entered)
+            for seed in self.seeds:
+                stack.enter_context(seed.report)
+            for threads in (self.env_threads, self.eval_threads):
+                stack.enter_context(threads)
             stack.callback(setattr, self, "left", True)
             self.opened = stack.pop_all()
         return self
@@ -271,8 +273,8 @@ class Run:
         """One update, from sampling windows to setting their priorities; waits for the device."""
         _, beta, hyper = self.now
         sampled = [seed.replay.sample(self.config.batch_size, beta) for seed in self.seeds]
-        rl_alone = self.updates % self.config.srl_every
-        update = self.device.update_rl if rl_alone else self.device.update
+        both, rl_alone = self.device.update, self.device.update_rl
+        update = rl_alone if rl_alone and self.updates % self.config.srl_every else both
         self.state, td_errors, metrics = update(self.state, [window for window, _ in sampled], hyper)
         self.updates += 1
         if self.agent.follow_every and self.updates % self.agent.follow_every == 0:

@@ -163,6 +163,8 @@ def _import_file(path: Path) -> None:
     # By a name that no other module has; what lies beside the file it may import.
     name = f"srl_jax_import_{path.stem}_{zlib.crc32(os.fsencode(path)):08x}"
     spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{path} is no Python file")
     module = importlib.util.module_from_spec(spec)
     if str(path.parent) not in sys.path:
         sys.path.append(str(path.parent))

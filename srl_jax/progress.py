@@ -34,7 +34,7 @@ class Progress:
         self,
         total: int,
         unit: str = "env steps",
-        stream: TextIO | None = None,
+        stream: TextIO | Display | None = None,
         clock: Callable[[], float] = time.monotonic,
         width: int | None = None,
     ):
@@ -48,9 +48,9 @@ class Progress:
         self._done = 0
         self._fields: dict[str, Any] = {}
         self._samples: deque[tuple[float, int]] = deque()
-        self._first = None
+        self._first: float | None = None
         self._drawn_at = -math.inf
-        self._drawn = None
+        self._drawn: int | None = None
         self._shown = 0  # characters of the bar that stand on the terminal's last line
         self._closed = False
 

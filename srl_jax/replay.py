@@ -96,7 +96,7 @@ class Replay:
             if not holds:
                 raise ValueError(message)
         self.num_streams, self.slots = num_streams, capacity // num_streams
-        self.frame_shape, self.stack, self.horizon = tuple(frame_shape), stack, horizon
+        self.frame_shape, self.stack, self.horizon = frame_shape, stack, horizon
         self.gamma, self.alpha = float(gamma), float(alpha)
 
         ring = (num_streams, self.slots)

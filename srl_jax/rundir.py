@@ -131,7 +131,7 @@ def _lock(descriptor: int, how: int) -> str:
     except BlockingIOError:
         raise
     except OSError as error:  # ENOSYS, ENOLCK, EOPNOTSUPP, ...: Lustre, NFS and others, as they are mounted
-        return error.strerror
+        return error.strerror or str(error)
     return ""
 
 

@@ -195,23 +195,27 @@ class Seed:
 
     def snapshot(self, state: TrainState, env_steps: int) -> checkpoint.State:
         """What a run needs beside its parameters to resume: the rest of the learner's state, and `parts`."""
-        arrays, numbers = {}, {}
+        arrays: dict[str, np.ndarray] = {}
+        numbers: dict[str, Any] = {}
         for part, (snapshot, _) in self.parts(env_steps).items():
             found, numbers[part] = snapshot()
             arrays |= {f"{part}_{name}": x for name, x in found.items()}
         unchanged = self.replay.unchanged_chunks(self.saved_position) if self.saved else ()
-        unchanged = frozenset(f"replay_{name}" for name in unchanged)
-        return checkpoint.State({"learner": _learner(state)}, arrays, numbers, unchanged)
+        names = frozenset(f"replay_{name}" for name in unchanged)
+        return checkpoint.State({"learner": _learner(state)}, arrays, numbers, names)
 
     def save_parameters(self, params: Params, env_steps: int, updates: int, **options: Any) -> Manifest:
         """Writes a checkpoint, without options of parameters alone; see `srl_jax.checkpoint.save`."""
-        counts = {
-            "num_actions": int(self.env.single_action_space.n),
-            "env_steps": env_steps,
-            "updates": updates,
-        }
-        frame = self.replay.frame_shape
-        return checkpoint.save(self.out, params, self.config, frame_shape=frame, **counts, **options)
+        return checkpoint.save(
+            self.out,
+            params,
+            self.config,
+            frame_shape=self.replay.frame_shape,
+            num_actions=int(self.env.single_action_space.n),
+            env_steps=env_steps,
+            updates=updates,
+            **options,
+        )
 
     def restore(self, manifest: Manifest) -> TrainState:
         """Brings a new seed to where a checkpoint was written; the report must not be open yet.

@@ -265,7 +265,7 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
     if name not in registry:
         raise SpecError(f"{where}: no {name!r}; {choices_text(name, registry)}")
     defaults = option_defaults(registry[name])
-    options = {}
+    options: dict[str, Any] = {}
     for key, value in texts.items():
         if key not in defaults:
             known = ", ".join(f"{k}={value_text(v)}" for k, v in defaults.items()) or "none"

@@ -39,9 +39,7 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     if taken:
-        raise ConfigError(
-            f"{path}: not an empty directory; name a new one (srl-jax resume resumes a run)"
-        )
+        raise ConfigError(f"{path}: not an empty directory; name a new one (srl-jax resume resumes a run)")
     modes.check(config)
     check_game(config)
     full = resolved(config)

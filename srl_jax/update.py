@@ -1,9 +1,10 @@
 """The update of an agent: where losses are summed and the encoder is stepped; also how it starts and acts."""
 
+import dataclasses
 import math
 import zlib
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -20,6 +21,10 @@ NORM_EVERY = 10
 """k: norms of the encoder's gradients and steps, each a pass over them, are metrics of every k-th update."""
 
 
+Scalar: TypeAlias = Array | np.floating | float
+"""One number: an array without axes counts."""
+
+
 class Hyper(NamedTuple):
     """The numbers of an update that may change without compiling it again: traced float32 scalars.
 
@@ -28,8 +33,8 @@ class Hyper(NamedTuple):
         learning_rates: {"encoder", "encoder_srl", "rl", "representation"}.
     """
 
-    weights: dict[str, Array]
-    learning_rates: dict[str, Array]
+    weights: Mapping[str, Scalar]
+    learning_rates: Mapping[str, Scalar]
 
 
 def named_key(key: jax.Array, name: str) -> jax.Array:
@@ -37,17 +42,17 @@ def named_key(key: jax.Array, name: str) -> jax.Array:
     return jax.random.fold_in(key, zlib.crc32(name.encode()))
 
 
-def periodic(every: int) -> Callable:
+@dataclasses.dataclass(frozen=True)
+class periodic:
     """The rule of a slow copy that the original replaces in every k-th update; k is `every`."""
 
-    def follow(new: Params, old: Params, step: Array) -> Params:
-        return jax.lax.cond(step % every == 0, lambda: new, lambda: old)
+    every: int
 
-    follow.every = every
-    return follow
+    def __call__(self, new: Params, old: Params, step: Array) -> Params:
+        return jax.lax.cond(step % self.every == 0, lambda: new, lambda: old)
 
 
-def ema(tau: float) -> Callable:
+def ema(tau: float) -> Callable[[Params, Params, Array], Params]:
     """The rule of a slow copy that is an exponential moving average, moved in every update.
 
     `slow = tau * slow + (1 - tau) * online`: tau is the share of the copy that stays. Near 1 it follows
@@ -66,7 +71,7 @@ def ema(tau: float) -> Callable:
     return follow
 
 
-def follow_every(objectives: dict[str, Objective]) -> int:
+def follow_every(objectives: Mapping[str, Objective]) -> int:
     """Updates after which a slow copy may change, in other words how often `make_follow` must be called.
 
     A rule that has no attribute `every`, as `periodic` has, changes its copy in every update.
@@ -75,7 +80,7 @@ def follow_every(objectives: dict[str, Objective]) -> int:
     return math.gcd(*(getattr(rule, "every", 1) for rule in rules))
 
 
-def make_follow(objectives: dict[str, Objective]) -> Callable:
+def make_follow(objectives: Mapping[str, Objective]) -> Callable:
     """follow: TrainState, after an update -> TrainState, its slow copies moved by their rules; pure."""
 
     def follow_all(state: TrainState) -> TrainState:
@@ -86,7 +91,7 @@ def make_follow(objectives: dict[str, Objective]) -> Callable:
 
 def make_init(
     encoder: Encoder,
-    objectives: dict[str, Objective],
+    objectives: Mapping[str, Objective],
     mode: Mode,
     optimizer: Optimizer,
     *,
@@ -100,7 +105,7 @@ def make_init(
     values depend on the key and its own name alone.
     """
 
-    def init(key: Array, given: Params | None = None) -> TrainState:
+    def init(key: jax.Array, given: Params | None = None) -> TrainState:
         start = named_key(key, "init")
         given = given or {}
         params = {n: o.init(named_key(start, f"head {n}")) for n, o in objectives.items() if n not in given}
@@ -160,7 +165,7 @@ def passes(mode: Mode, active: Collection[str], encoder_optimizer: str) -> tuple
 
 def make_update(
     encoder: Encoder,
-    objectives: dict[str, Objective],
+    objectives: Mapping[str, Objective],
     mode: Mode,
     optimizer: Optimizer,
     *,
@@ -229,7 +234,10 @@ def make_update(
             raise ValueError(f"weights {sorted(hyper.weights)} for losses {sorted(objectives)}")
         measure = state.step % NORM_EVERY == 0
         params, opt_state = state.params, state.opt_state
-        losses, extra, metrics, lengths = {}, {}, {"loss/total": 0.0}, []
+        losses: dict[str, Array] = {}
+        extra: dict[str, dict[str, Array]] = {}
+        metrics: dict[str, Any] = {"loss/total": 0.0}
+        lengths: list[tuple[Params, Params]] = []
         for one, losses_of in steps:
             at = state.params if encoder_optimizer == "simultaneous" else params
 
@@ -274,13 +282,13 @@ def rate_of(moments: str) -> str:
 
 def _length_ratio(first: tuple[Params, Params], second: tuple[Params, Params]) -> Array:
     """The length of the second step, (parameters after, before), over the first's."""
-    first, second = (optax.tree.norm(optax.tree.sub(*step)) for step in (first, second))
-    return second / jnp.maximum(first, 1e-30)
+    before, now = (optax.tree.norm(optax.tree.sub(*step)) for step in (first, second))
+    return now / jnp.maximum(before, 1e-30)
 
 
 def make_losses(
     encoder: Encoder,
-    objectives: dict[str, Objective],
+    objectives: Mapping[str, Objective],
     mode: Mode,
     *,
     augment: str,
@@ -319,7 +327,7 @@ def make_losses(
 
 def make_conflict(
     encoder: Encoder,
-    objectives: dict[str, Objective],
+    objectives: Mapping[str, Objective],
     mode: Mode,
     *,
     augment: str,
@@ -357,12 +365,13 @@ def make_conflict(
     return conflict
 
 
-def follow(objectives: dict[str, Objective], params: Params, slow: Params, step: Array) -> Params:
+def follow(objectives: Mapping[str, Objective], params: Params, slow: Params, step: Array) -> Params:
     """The slow copies after an update, {name: {"encoder", "head"}}, each by its objective's rule."""
+    rules = {name: objective.slow for name, objective in objectives.items() if objective.slow}
     moved = {}
     for name, old in slow.items():
         lagged = params["encoder"] if jax.tree.leaves(old["encoder"]) else {}
-        moved[name] = objectives[name].slow({"encoder": lagged, "head": params[name]}, old, step)
+        moved[name] = rules[name]({"encoder": lagged, "head": params[name]}, old, step)
     return moved
 
 

@@ -3,8 +3,9 @@
 import csv
 import functools
 import importlib.resources
+import io
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -53,6 +54,7 @@ class Published(NamedTuple):
             "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not
             known: sticky actions, seeds", say; "" if nothing differs.
         """
+        compared: dict[str, tuple[float | None, float | None]]
         compared = {"sticky actions": (self.sticky_actions, config.sticky_actions)}
         if self.env_steps is not None:
             compared |= {
@@ -213,12 +215,15 @@ def published(game: str) -> list[Published]:
     return [_record(Published, row) for row in rows]
 
 
-def _record(kind: type, row: Mapping[str, str]):
+_Record = TypeVar("_Record", Published, ReferencePolicy)
+
+
+def _record(kind: type[_Record], row: Mapping[str, str]) -> _Record:
     """A row of a table as a named tuple; an empty field is None."""
-    return kind(*(_KINDS.get(name, str)(row[name]) if row.get(name) else None for name in kind._fields))
+    return kind._make(_KINDS.get(name, str)(row[name]) if row.get(name) else None for name in kind._fields)
 
 
-_KINDS = {
+_KINDS: dict[str, type[int | float]] = {
     "env_steps": int,
     "score": float,
     "spread": float,
@@ -244,8 +249,7 @@ def _reference_scores() -> dict[str, tuple[float, float]]:
 @functools.cache
 def _rows(name: str) -> list[dict[str, str]]:
     source = importlib.resources.files(__package__) / name
-    with source.open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(io.StringIO(source.read_bytes().decode(), newline="")))
 
 
 def ram_labels(game: str) -> dict[str, int]:

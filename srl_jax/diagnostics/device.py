@@ -91,9 +91,9 @@ def _enough(decode: Callable, objective: Objective, encoder: Encoder, channels: 
     def shape(dtype, *of):
         return jax.ShapeDtypeStruct((2, *of), dtype)
 
-    numbers = [shape(jnp.float32, steps)] * 3
+    actions, numbers = shape(jnp.int32, steps), shape(jnp.float32, steps)
     frames = shape(jnp.uint8, depth // channels + steps, height, width, channels)
-    window = Window(frames, shape(jnp.int32, steps), *numbers, shape(jnp.float32))
+    window = Window(frames, actions, numbers, numbers, numbers, shape(jnp.float32))
     head = jax.eval_shape(objective.init, jax.random.key(0))
     try:
         jax.eval_shape(decode, head, shape(jnp.float32, encoder.features), window)

@@ -41,7 +41,7 @@ class HeldOut(NamedTuple):
     @property
     def observations(self) -> np.ndarray:
         """s_t: uint8 [N, S, H, W, C]."""
-        frames, horizon = self.windows.frames, self.windows.actions.shape[1]
+        frames, horizon = np.asarray(self.windows.frames), self.windows.actions.shape[1]
         return frames[:, : frames.shape[1] - horizon]
 
 
@@ -105,7 +105,8 @@ def _collect(
         take = [i for i in everyone if due[i] < wanted.shape[1] and step >= wanted[i, due[i]]]
         for i in take:
             index = (replay.next_position[i] - 1) * ENVS + i
-            rows.append((int(index), info["state"][i] if env.state_names else (), int(episodes[i])))
+            state = info["state"][i] if env.state_names else np.zeros(0)
+            rows.append((int(index), state, int(episodes[i])))
             due[i] += 1
         frames, rewards, terminated, truncated, info = env.step(action)
         length += 1
@@ -120,10 +121,13 @@ def _collect(
             length[over] = 0
     env.close()
     indices, states, of_episode = zip(*[rows[i] for i in order], strict=True)
-    states = np.array(states if env.state_names else [()] * number, np.float64)
     held_out = HeldOut(
-        replay.gather(np.array(indices)), states, env.state_names, np.array(of_episode), env.state_problem
+        replay.gather(np.array(indices)),
+        np.array(states, np.float64),
+        env.state_names,
+        np.array(of_episode),
+        env.state_problem,
     )
-    for array in (*held_out.windows, held_out.states, held_out.episodes):
+    for array in map(np.asarray, (*held_out.windows, held_out.states, held_out.episodes)):
         array.setflags(write=False)
     return held_out

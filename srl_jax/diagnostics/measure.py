@@ -182,7 +182,7 @@ class Diagnostics:
         for step in before:
             if step not in self._kept and (parts := self._read(step, template)):
                 self._kept[step] = self._keep(parts["encoder"])
-        return {step: self._kept[step] for step in before if self._kept[step] is not None}
+        return {step: kept for step in before if (kept := self._kept[step]) is not None}
 
     def _read(self, step: int, template: Params) -> Params | None:
         """What was kept of an epoch; None, once named and left out from then on, if it cannot be read."""

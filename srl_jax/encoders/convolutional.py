@@ -6,11 +6,12 @@ from typing import NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
+from jax import Array
 
 from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.layers import INITIALISERS, Conv, ConvTranspose, Dense, WideDense
 from srl_jax.specs import choices_text
-from srl_jax.types import Array, Encoder
+from srl_jax.types import Encoder
 
 LEAST_SEEN = 0.95
 """The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
@@ -79,12 +80,13 @@ class EncoderNetwork(nn.Module):
             gain /= 255.0
         for i, layer in enumerate(self.layers):
             # The first kernel is multiplied by the gain, not the image: the same, with fewer bytes.
-            first = {"zero_sum": zero_sum, "gain": gain} if i == 0 else {}
-            padding = tuple(
+            first = i == 0
+            rows, columns = (
                 (0, max(0, (after - 1) * layer.stride + layer.kernel - before))
                 for before, after in zip(self.sizes[i], self.sizes[i + 1], strict=True)
             )
-            x = nn.relu(Conv(*layer, init, **first, padding=padding)(x))
+            conv = Conv(*layer, init, zero_sum and first, gain if first else 1.0, padding=(rows, columns))
+            x = nn.relu(conv(x))
         x = x.reshape(x.shape[0], -1)
         if not self.features:
             return x

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.convolutional import Start
 from srl_jax.layers import Conv, Dense, WideDense
 from srl_jax.specs import check_size
-from srl_jax.types import Array, Encoder
+from srl_jax.types import Encoder
 
 CHANNELS = (16, 32, 32)
 """Of the three stages, at a width of 1."""
@@ -50,8 +51,8 @@ class ImpalaEncoder(nn.Module):
         if x.dtype == jnp.uint8:
             gain /= 255.0
         for i, channels in enumerate(self.channels):
-            first = {"zero_sum": zero_sum, "gain": gain} if i == 0 else {}
-            x = Conv(channels, 3, 1, initial, padding="SAME", **first)(x)
+            first = i == 0
+            x = Conv(channels, 3, 1, initial, zero_sum and first, gain if first else 1.0, padding="SAME")(x)
             x = Residual(initial)(halved(x))
         x = nn.relu(x).reshape(x.shape[0], -1)
         return nn.relu(Dense(self.features)(x))
@@ -138,10 +139,11 @@ def impala(
     check_size("width", width)
     start = Start(init, zero_sum, gain, decoder_scale)
     start.check()
-    *size, depth = observation_shape
-    channels, sizes = tuple(width * n for n in CHANNELS), [tuple(size)]
+    rows, columns, depth = observation_shape
+    channels, sizes = tuple(width * n for n in CHANNELS), [(rows, columns)]
     for _ in channels:
-        sizes.append(tuple(-(-side // 2) for side in sizes[-1]))
+        rows, columns = -(-rows // 2), -(-columns // 2)
+        sizes.append((rows, columns))
     network = ImpalaEncoder(channels, features, start)
     decoder = ImpalaDecoder(channels, tuple(sizes), depth, start)
     return flax_encoder(network, decoder, observation_shape, map_shape=(*sizes[-1], channels[-1]))

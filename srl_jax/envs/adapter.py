@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box, Dict, Discrete, Space
 
 from srl_jax.envs import pixels
-from srl_jax.envs.base import FrameVectorEnv
+from srl_jax.envs.base import FrameVectorEnv, check_number
 from srl_jax.errors import ConfigError
 
 PACKAGES = {"MiniGrid": "minigrid", "BabyAI": "minigrid", "MiniWorld": "miniworld", "ALE": "ale_py"}
@@ -21,7 +21,7 @@ def made(id: str, render: bool) -> gymnasium.Env:
     package = PACKAGES.get(re.split("[-/]", id)[0])
     if package and id not in gymnasium.registry:
         id = f"{package}:{id}"
-    mode = {"render_mode": "rgb_array"} if render else {}
+    mode: dict[str, Any] = {"render_mode": "rgb_array"} if render else {}
     return gymnasium.make(id, disable_env_checker=True, **mode)
 
 
@@ -79,16 +79,17 @@ class Adapter(FrameVectorEnv):
                 reason that follows the game's name.
             ValueError: num_envs or seed is out of its range.
         """
+        check_number(num_envs)
         try:
             self._envs = [make_one() for _ in range(num_envs)]
         except Exception as error:
             what = " ".join(str(error).split())
             raise ConfigError(f"cannot be made: {type(error).__name__}: {what}") from error
         self._grey, self._render, self._skip, self._max_steps = grey, render, frame_skip, max_steps
-        first = self._envs[0].unwrapped if self._envs else None
+        first = self._envs[0].unwrapped
         actions = _actions(first)
         self._colours = 3 if render else _colours(first)
-        names = getattr(first, "get_action_meanings", list)()
+        names: list[str] = getattr(first, "get_action_meanings", list)()
         height, width = (frame_size, frame_size) if frame_size else self._own_size()
         super().__init__(
             num_envs=num_envs,
@@ -99,7 +100,7 @@ class Adapter(FrameVectorEnv):
         self._first_action = int(actions.start)
         self.state_names = tuple(getattr(first, "state_names", ()))
         self._resize = bool(frame_size)
-        self._frames = np.zeros(self.observation_space.shape, np.uint8)
+        self._frames = np.zeros((num_envs, *self.single_observation_space.shape), np.uint8)
         self._states = np.zeros((num_envs, len(self.state_names)), np.float32)
         self._episodes = np.zeros(num_envs, np.int64)
         self._actions: list[list[int]] = [[] for _ in range(num_envs)]  # of the episode that goes on
@@ -107,11 +108,14 @@ class Adapter(FrameVectorEnv):
     def _own_size(self) -> tuple[int, int]:
         """Height and width of what the environment shows."""
         env = self._envs[0]
+        image: Any = env.observation_space
         if self._render:
             env.reset(seed=0)
-            return np.shape(env.render())[:2]
-        space: Any = env.observation_space
-        return (space["image"] if isinstance(space, Dict) else space).shape[:2]
+            image = np.asarray(env.render())
+        elif isinstance(image, Dict):
+            image = image["image"]
+        height, width = image.shape[:2]
+        return height, width
 
     def _reset(self, mask, seeded):
         if seeded:

@@ -251,7 +251,7 @@ class Atari(FrameVectorEnv):
 
     def close_extras(self, **kwargs):
         """Ends ALE's threads."""
-        self._envs = None
+        vars(self).pop("_envs", None)
 
 
 def shown(frames: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import hashlib
 import operator
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
@@ -41,19 +41,27 @@ class FrameVectorEnv(VectorEnv):
 
     # Not inherited: ale_py writes its own mode into the dict of gymnasium's base class.
     metadata = {"autoreset_mode": AutoresetMode.DISABLED}
+    single_observation_space: Box
+    single_action_space: Discrete
     state_names: tuple[str, ...] = ()
     state_problem = ""
     _restored_by = ""
     """How `_restore` rebuilds the state, and what it means where that fails: follows the error."""
 
-    def __init__(self, *, num_envs: int, seed: int, frame_shape: tuple, action_meanings: tuple):
+    def __init__(
+        self,
+        *,
+        num_envs: int,
+        seed: int,
+        frame_shape: tuple[int, int, int],
+        action_meanings: Iterable[str],
+    ):
         """Sets up the spaces and the seeds; `frame_shape` is (H, W, C).
 
         Raises:
             ValueError: num_envs is not positive or seed is negative.
         """
-        if num_envs < 1:
-            raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+        check_number(num_envs)
         self.num_envs = num_envs
         self.action_meanings = tuple(action_meanings)
         self.single_observation_space = Box(0, 255, frame_shape, np.uint8)
@@ -234,6 +242,12 @@ class FrameVectorEnv(VectorEnv):
         if actions.min() < 0 or actions.max() >= count:
             raise ValueError(f"actions must lie in [0, {count}), got {actions.tolist()}")
         return actions
+
+
+def check_number(num_envs: int) -> None:
+    """Raises ValueError if it is not positive."""
+    if num_envs < 1:
+        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
 
 
 def check_seed(seed: int) -> int:

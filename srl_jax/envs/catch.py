@@ -114,7 +114,7 @@ class Catch(FrameVectorEnv):
             self._episodes[mask] = 0
         if self._background is not None and (seeded or not self._started):
             self._background.restart(mask)
-        for i in np.flatnonzero(mask):
+        for i in np.flatnonzero(mask).tolist():
             rng = np.random.default_rng(self._stream(i, 0, int(self._episodes[i])))
             self._fall[i], steps = self._drops[rng.integers(len(self._drops))]
             self._ball_x[i] = rng.integers(self._left, self._right + 1)

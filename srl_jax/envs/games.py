@@ -174,7 +174,12 @@ def adapted(
     """
     if frame_skip < 1:
         raise ValueError("frame_skip must be at least 1")
-    adaption = {"grey": grey, "render": render, "frame_skip": frame_skip, "max_steps": max_steps}
+    adaption: dict[str, Any] = {
+        "grey": grey,
+        "render": render,
+        "frame_skip": frame_skip,
+        "max_steps": max_steps,
+    }
 
     def make(**options):
         from srl_jax.envs.adapter import Adapter

@@ -63,9 +63,9 @@ class Twin:
 
     def step(self, action: int, look: bool) -> None:
         """One env step. Of the last two screens, which a frame is made of, copies are kept where `look`."""
-        action, self._screens = self._actions[action], []
+        chosen, self._screens = self._actions[action], []
         for i in range(FRAME_SKIP):
-            self._ale.act(action)
+            self._ale.act(chosen)
             if self._ale.game_over():
                 break
             if look and i >= FRAME_SKIP - 2:

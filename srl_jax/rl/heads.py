@@ -3,9 +3,9 @@
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from srl_jax.layers import Dense, NoisyDense, factorised_noise
-from srl_jax.types import Array
 
 
 class QNetwork(nn.Module):

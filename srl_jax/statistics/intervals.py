@@ -177,4 +177,5 @@ def _interval(point, low, high, *arms: Mapping[str, np.ndarray]) -> Interval:
     kind = NONE if fewest < 2 else NARROW if fewest < ENOUGH else BOOTSTRAP
     if kind == NONE:
         low, high = np.full_like(low, np.nan), np.full_like(high, np.nan)
-    return Interval(*(np.asarray(x, np.float64) for x in (point, low, high)), kind)
+    point, low, high = (np.asarray(x, np.float64) for x in (point, low, high))
+    return Interval(point, low, high, kind)

@@ -81,7 +81,7 @@ def summary(
         mine = normal[arm]
         for name, statistic in AGGREGATES.items():
             add(name, estimate(statistic, mine, **how), arm, None, mine)
-        if theirs:
+        if baseline is not None and theirs:
             base = normal[baseline]
             for name, statistic in AGGREGATES.items():
                 found = estimate_difference(mine, base, statistic, **how)
