@@ -18,8 +18,13 @@ STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 # A flag and its value, unless ARGS gives that flag: none may be given twice.
 unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
+# Tests that start few processes and compile little, half a minute in all.
+FAST := actor arms augment colours config control_groups curves data docs ending envs_base help metrics \
+	optim progress reading replay rl_losses rundir specs statistics sumtree \
+	sweeping_plan sweeping_table window
+
 .DEFAULT_GOAL := help
-.PHONY: help install test train lint soak bench bench-gpu bench-install
+.PHONY: help install check test train lint soak bench bench-gpu bench-install
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
@@ -39,6 +44,9 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check \
 		-c constraints.txt -e '.[dev,tensorboard]'
 	@rm -f $(VENV)/.installed-* && touch $@
+
+check: lint ## check style, types and what is tested fast (under a minute)
+	@$(VENV)/bin/python -m mypy && $(VENV)/bin/python -m pytest -q $(FAST:%=tests/%_test.py) $(ARGS)
 
 test: install ## run all tests
 	@$(VENV)/bin/python -m pytest -q $(ARGS)

@@ -73,6 +73,11 @@ def make(kind=Square, frame_size=64, num_envs=2, seed=0, **options):
     return envs.adapted(kind, **options).make(num_envs=num_envs, seed=seed, frame_size=frame_size)
 
 
+def test_there_must_be_environments():
+    with pytest.raises(ValueError, match="num_envs must be at least 1, got 0"):
+        make(num_envs=0)
+
+
 def test_the_interface():
     env = make(num_envs=3)
     assert env.single_observation_space == Box(0, 255, (64, 64, 3), np.uint8)

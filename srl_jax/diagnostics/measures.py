@@ -167,9 +167,8 @@ def probe(latents: np.ndarray, states: np.ndarray, episodes: np.ndarray) -> np.n
         # The errors on observations that are left out together: the block of the inverse, inverted (Allen's
         # PRESS is the case of one).
         inverted = (vectors * inverse) @ vectors.T
-        left_out = sum(
-            (np.linalg.solve(inverted[np.ix_(one, one)], dual[one]) ** 2).sum(0) for one in together
-        )
+        errors = ((np.linalg.solve(inverted[np.ix_(one, one)], dual[one]) ** 2).sum(0) for one in together)
+        left_out = sum(errors, np.zeros(()))
         better = left_out < best
         best[better], weights[:, better] = left_out[better], dual[:, better]
     error = ((z[~fits] @ (z[fits].T @ weights) - y[~fits]) ** 2).sum(0)

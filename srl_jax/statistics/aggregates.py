@@ -98,7 +98,8 @@ def performance_profile(scores: Scores, thresholds: Sequence[float]) -> np.ndarr
         float64 [..., T].
     """
     games = by_game(scores)
-    return sum((x[..., None] > np.asarray(thresholds)).mean(-2) for x in games.values()) / len(games)
+    shares = ((x[..., None] > np.asarray(thresholds)).mean(-2) for x in games.values())
+    return sum(shares, np.zeros(())) / len(games)
 
 
 AGGREGATES: dict[str, Statistic] = {
