@@ -190,8 +190,8 @@ def to_resume(path: Path, config: Config, at_most: int | None = None) -> Manifes
     there = Config.load(path)
     if differing := another_run(there, config):
         raise ConfigError(
-            f"--out={path}: the run there has another configuration: {differing}; resume it with its own, "
-            "name another directory, or --overwrite without --resume starts anew"
+            f"--out={path}: the run there has another configuration: {differing}; srl-jax resume {path} "
+            "takes its own, name another directory, or --overwrite without --resume starts anew"
         )
     manifest = checkpoint.newest_good(path, say, at_most)
     if manifest is None:

@@ -176,7 +176,10 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         )
         draw([directory for directory, _ in runs], [config for _, config in runs], results)
     if any(result.interrupted for result in results):
-        print(f"stopped after {results[0].env_steps} env steps; --resume=auto resumes from there, in {path}")
+        done, saved = results[0].env_steps, results[0].saved
+        where = "from there" if saved == done else f"from its checkpoint of {saved}"
+        how = "there is no checkpoint" if saved is None else f"srl-jax resume {path} resumes {where}"
+        print(f"stopped after {done} env steps; {how}")
         return 128 + (caught[0] if caught else signal.SIGINT)
     done = f"{results[0].env_steps} env steps, {results[0].updates} updates"
     print(f"{done}{' of each seed' if seeds else ''}; everything is in {path}")

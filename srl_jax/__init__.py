@@ -14,7 +14,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from srl_jax import encoders, objectives
+    from srl_jax import encoders, envs, objectives
     from srl_jax.config import Config
     from srl_jax.loading import load
     from srl_jax.replay import Replay
@@ -32,12 +32,13 @@ else:  # a checker would take any name for one that is there
 
 
 __version__ = "0.1.0"
-__all__ = ["Config", "Replay", "__version__", "encoders", "load", "losses", "objectives", "train"]
+__all__ = ["Config", "Replay", "__version__", "encoders", "envs", "load", "losses", "objectives", "train"]
 
 _MODULES = {
     "Config": "srl_jax.config",
     "Replay": "srl_jax.replay",
     "encoders": "srl_jax.encoders",
+    "envs": "srl_jax.envs",
     "load": "srl_jax.loading",
     "losses": "srl_jax.rl.losses",
     "objectives": "srl_jax.objectives",

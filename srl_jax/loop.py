@@ -40,7 +40,8 @@ class Result(NamedTuple):
 
     Attributes:
         env_steps, updates: done.
-        interrupted: whether it was stopped before its end; its checkpoint is of that moment.
+        interrupted: whether it was stopped before its end.
+        saved: env steps of the newest checkpoint that can be resumed from; None without one.
         pictures: {objective: (inputs, targets, outputs)}, see `srl_jax.diagnostics.pictures`.
         recording: uint8 [T, H, W, C], the first games of the last evaluation; None without one.
     """
@@ -48,6 +49,7 @@ class Result(NamedTuple):
     env_steps: int
     updates: int
     interrupted: bool
+    saved: int | None
     pictures: dict[str, tuple]
     recording: np.ndarray | None
 
@@ -197,7 +199,9 @@ class Run:
             for i, seed in enumerate(self.seeds):
                 params = self.device.part(self.state.params, i)
                 drawn = pictures(self.agent, params, seed.replay, self.now.beta)
-                results.append(Result(self.env_steps, self.updates, not finished, drawn, seed.recording))
+                saved = seed.saved and seed.saved.env_steps
+                counts = self.env_steps, self.updates, not finished, saved
+                results.append(Result(*counts, drawn, seed.recording))
         return results
 
     def run(self) -> bool:
@@ -209,6 +213,10 @@ class Run:
             self.start_evaluation()
         while self.env_steps < config.steps:
             if self.stop():
+                if self.evaluating and not all(game.done() for game in self.evaluating.games):
+                    progress.note(
+                        "stopping once the evaluation under way is over; a second signal ends at once"
+                    )
                 self.save()
                 progress.note(f"stopped after {self.env_steps} env steps; a checkpoint is written")
                 return False

@@ -46,7 +46,9 @@ class Loop(types.ModuleType):
         self.calls.append((config, out))
         self.resumed.append(resume)
         (pathlib.Path(out) / "metrics.jsonl").touch()
-        return types.SimpleNamespace(env_steps=0, updates=0, interrupted=False, pictures={}, recording=None)
+        return types.SimpleNamespace(
+            env_steps=0, updates=0, interrupted=False, saved=None, pictures={}, recording=None
+        )
 
 
 def test_seeds_get_a_run_directory_each(loop, tmp_path):
@@ -521,13 +523,15 @@ def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkey
         with pytest.raises(KeyboardInterrupt):  # who asks twice does not wait
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(10)
-        return types.SimpleNamespace(env_steps=40, updates=0, interrupted=True, pictures={}, recording=None)
+        return types.SimpleNamespace(
+            env_steps=40, updates=0, interrupted=True, saved=40, pictures={}, recording=None
+        )
 
     monkeypatch.setattr(loop, "train", stopped)
     handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     assert _train(*CATCH, f"--out={tmp_path}/run") == 128 + number
     assert capsys.readouterr().out.endswith(
-        f"stopped after 40 env steps; --resume=auto resumes from there, in {tmp_path}/run\n"
+        f"stopped after 40 env steps; srl-jax resume {tmp_path}/run resumes from there\n"
     )
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
@@ -599,7 +603,7 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
     assert first.returncode == 128 + signal.SIGTERM
     stopped = checkpoint.read_manifest(out).env_steps
     assert 80 <= stopped < 1200
-    line = f"stopped after {stopped} env steps; --resume=auto resumes from there, in {out}"
+    line = f"stopped after {stopped} env steps; srl-jax resume {out} resumes from there"
     assert line in printed.splitlines()
 
     done = _python("-m", "srl_jax", "resume", str(out), "--tune_runtime=off")

@@ -336,7 +336,9 @@ def test_what_a_run_has_written_is_kept(tmp_path, kind):
     with pytest.raises(ConfigError, match="not empty; name a new directory"):
         check_out(str(path), CONFIG, overwrite=False, resume=False)
     if kind != "a checkpoint":
-        with pytest.raises(ConfigError, match="another configuration: gamma .*; resume it with its own"):
+        with pytest.raises(
+            ConfigError, match="another configuration: gamma .*; srl-jax resume .* takes its own"
+        ):
             to_resume(path, dataclasses.replace(CONFIG, gamma=0.5))
 
 
