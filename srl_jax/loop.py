@@ -213,10 +213,10 @@ class Run:
             self.start_evaluation()
         while self.env_steps < config.steps:
             if self.stop():
-                if self.evaluating and not all(game.done() for game in self.evaluating.games):
-                    progress.note(
-                        "stopping once the evaluation under way is over; a second signal ends at once"
-                    )
+                under_way = self.evaluating and not all(game.done() for game in self.evaluating.games)
+                if under_way and not self.is_saved:
+                    awaited = "stopping once the evaluation under way is over"
+                    progress.note(f"{awaited}; a second signal ends at once")
                 self.save()
                 progress.note(f"stopped after {self.env_steps} env steps; a checkpoint is written")
                 return False
@@ -328,8 +328,8 @@ class Run:
     def write_train_rows(self) -> None:
         """A "train" row of each seed: schedules, and means since the last one."""
         self.check_losses()
+        epsilon, beta, _ = self.now
         for seed in self.seeds:
-            epsilon, beta, _ = self.now
             values = {"epsilon": epsilon, "beta": beta, "replay/transitions": len(seed.replay)}
             seed.report.train_row(self.env_steps, self.updates, values)
 
@@ -389,13 +389,19 @@ class Run:
 
     # Checkpoints
 
+    @property
+    def is_saved(self) -> bool:
+        """Whether there are checkpoints of this moment that can be resumed from."""
+        saved = self.seeds[0].saved
+        return saved is not None and saved.env_steps == self.env_steps
+
     def save(self, evaluation_due: bool = False) -> None:
         """Writes checkpoints that can be resumed from, unless there are some of this moment.
 
         Args:
             evaluation_due: whether an evaluation of this moment comes next.
         """
-        if self.seeds[0].saved is not None and self.seeds[0].saved.env_steps == self.env_steps:
+        if self.is_saved:
             return
         self.finish_evaluation()
         self.check_losses()

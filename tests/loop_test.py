@@ -322,6 +322,22 @@ def test_a_run_that_is_told_to_stop_saves_and_says_so(tmp_path, capsys):
     assert whole(path).env_steps == 52 and "run.json" in whole(path).files
 
 
+def test_a_stop_right_after_a_checkpoint_waits_for_no_evaluation(tmp_path, capsys, monkeypatch):
+    original = loop.Run.play
+
+    def play(run, i, params, env_steps):  # the second evaluation takes as long as anybody waits for it
+        while env_steps and not run.left:
+            time.sleep(0.01)
+        return original(run, i, params, env_steps)
+
+    monkeypatch.setattr(loop.Run, "play", play)
+    calls = itertools.count()
+    result = train(tmp_path / "run", progress=True, stop=lambda: next(calls) == 30)
+    assert result.interrupted and result.env_steps == result.saved == 120
+    said = capsys.readouterr().err
+    assert "stopped after 120 env steps; a checkpoint is written" in said and "stopping once" not in said
+
+
 def broken(update, at, name, td_error):
     """An update whose number `at` gives NaN: in one loss, and in temporal-difference errors or not."""
     calls = itertools.count(1)
