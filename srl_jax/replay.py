@@ -39,6 +39,19 @@ def _check(name, array, shape, dtype):
     return array
 
 
+def fitting(arrays: Mapping[str, np.ndarray], name: str, own: np.ndarray) -> np.ndarray:
+    """An array of a snapshot that is to take the place of one's own.
+
+    Raises:
+        ValueError: it has another shape or dtype, in one line.
+    """
+    found = arrays[name]
+    if (found.shape, found.dtype) != (own.shape, own.dtype):
+        message = f"must be {own.dtype} {own.shape}, got {found.dtype} {found.shape}"
+        raise ValueError(f"snapshot: {name} {message}")
+    return found
+
+
 class Replay:
     """Prioritized replay (Schaul et al. 2016, the proportional variant, stratified).
 
@@ -302,22 +315,16 @@ class Replay:
             ValueError: an array has another shape or dtype, in one line; the replay is of no use then.
         """
 
-        def fitting(name, own):
-            if ((found := arrays[name]).shape, found.dtype) != (own.shape, own.dtype):
-                message = f"must be {own.dtype} {own.shape}, got {found.dtype} {found.shape}"
-                raise ValueError(f"replay snapshot: {name} {message}")
-            return found
-
         for name in _ARRAYS:
             own = getattr(self, name)
-            own[...] = fitting(name, own)
+            own[...] = fitting(arrays, name, own)
         for name in _NUMBERS:
             setattr(self, name, numbers[name])
-        self.tree.fill(fitting("priorities", self.tree.leaves))
+        self.tree.fill(fitting(arrays, "priorities", self.tree.leaves))
         self.rng.bit_generator.state = numbers["rng"]
         for name, slots in self._chunks():
             own = self.frames[:, slots]
-            own[:] = fitting(name, own)
+            own[:] = fitting(arrays, name, own)
 
     def changed_slots(self, since: np.ndarray) -> np.ndarray:
         """Which slots, bool [L], had a frame written in any stream since an earlier moment.

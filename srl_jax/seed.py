@@ -17,7 +17,7 @@ from srl_jax.diagnostics.measure import Diagnostics
 from srl_jax.errors import ConfigError
 from srl_jax.evaluate import Evaluation, evaluate
 from srl_jax.optim import real_copy
-from srl_jax.replay import Replay
+from srl_jax.replay import Replay, fitting
 from srl_jax.reporting import Report
 from srl_jax.types import Params, TrainState
 
@@ -178,9 +178,9 @@ class Seed:
 
     def _restore(self, arrays: Mapping[str, np.ndarray], numbers: Mapping[str, Any]) -> None:
         for name, own in (("stacks", self.stacks.frames), ("score", self.score)):
-            found = arrays[name]
-            if (found.shape, found.dtype) != (own.shape, own.dtype) or not np.isfinite(found).all():
-                raise ValueError(f"{name} is {found.dtype} {found.shape}, not {own.dtype} {own.shape}")
+            found = fitting(arrays, name, own)
+            if not np.isfinite(found).all():
+                raise ValueError(f"snapshot: {name} is not finite")
             own[:] = found
         self.recording = arrays["recording"] if "recording" in arrays else None
         self.rng.bit_generator.state = numbers["rng"]
