@@ -23,7 +23,7 @@ from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import parse_row
 from srl_jax.reading import ROWS as MOST_BYTES
-from srl_jax.reading import parse_json, read_bytes, replace_text
+from srl_jax.reading import parse_json, read_bytes, replace_bytes, replace_text
 
 from . import flags as config_flags
 from .directories import natural, runs_below
@@ -121,9 +121,7 @@ def write(folder: Path, runs: Iterable[RunData]) -> None:
         groups.setdefault((run.game, run.arm), []).append(run)
     configs = [_arm(folder, members) for members in groups.values()]
     folder.mkdir(parents=True, exist_ok=True)
-    partial = folder / f"{ROWS}.partial"
-    partial.write_bytes(gzip.compress("".join(lines).encode(), mtime=0))
-    os.replace(partial, folder / ROWS)
+    replace_bytes(folder / ROWS, gzip.compress("".join(lines).encode(), mtime=0))
     replace_text(folder / CONFIGS, json.dumps(configs, indent=1) + "\n")
 
 

@@ -39,14 +39,19 @@ def read_bytes(path: str | os.PathLike, limit: int = sys.maxsize) -> bytes:
 
 
 def replace_text(path: Path, text: str) -> None:
+    """`replace_bytes` of a text in UTF-8."""
+    replace_bytes(path, text.encode("utf-8"))
+
+
+def replace_bytes(path: Path, data: bytes) -> None:
     """Writes a file at once, flushed to disk: no process that is killed leaves half of it.
 
     Raises:
         OSError: it could not be written; it is as it was.
     """
     partial = path.with_name(f"{path.name}.partial")
-    with open(partial, "w", encoding="utf-8") as file:
-        file.write(text)
+    with open(partial, "wb") as file:
+        file.write(data)
         file.flush()
         os.fsync(file.fileno())
     os.replace(partial, path)
