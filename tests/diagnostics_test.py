@@ -30,6 +30,12 @@ RNG = np.random.default_rng(0)
 # Rank, dormancy, drift
 
 
+def keep(path, parts, config, step):
+    """Writes what diagnostics keep of an epoch, as a run does."""
+    counts = {"num_actions": 3, "env_steps": step, "updates": 0}
+    checkpoint.save(path, parts, config, frame_shape=(42, 42, 1), keep=0, folder="encoders", **counts)
+
+
 def test_effective_rank():
     # Four points, centred: singular values 4 and 2 and no others. Shares 2/3 and 1/3.
     z = np.array([[2, 1], [2, -1], [-2, 1], [-2, -1.0]], np.float32) @ np.eye(2, 5) + 7
@@ -309,15 +315,7 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     assert first.steps == (0, 60, 120, 180)
     for step in (0, 60):
         values = first.measure(state, step, None, 1.0, None)
-        arguments = {
-            "frame_shape": (42, 42, 1),
-            "num_actions": 3,
-            "env_steps": step,
-            "updates": 0,
-            "keep": 0,
-            "folder": "encoders",
-        }
-        checkpoint.save(tmp_path, first.parts(params), config, **arguments)
+        keep(tmp_path, first.parts(params), config, step)
     assert values["diag/drift/steps"] == [0] and values["diag/drift/cka"] == [pytest.approx(1)]
     assert json.loads(json.dumps(values, allow_nan=False)) == values
     expected = first.measure(state, 120, None, 1.0, None)
@@ -449,15 +447,7 @@ def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
     def measure(step):
         params = {"encoder": {"w": np.float32(0.5)}, "x": {"w": np.float32(step)}}
         values = diagnostics.measure(TrainState(params, {}, None, np.int32(0), None), step, None, 1.0, None)
-        arguments = {
-            "frame_shape": (42, 42, 1),
-            "num_actions": 3,
-            "env_steps": step,
-            "updates": 0,
-            "keep": 0,
-            "folder": "encoders",
-        }
-        checkpoint.save(tmp_path, diagnostics.parts(params), config, **arguments)
+        keep(tmp_path, diagnostics.parts(params), config, step)
         return [values[f"diag/{which}/x"] for which in ("decoder_now", "encoder_now")]
 
     assert measure(0) == [[0.0], []]

@@ -115,20 +115,25 @@ def test_huber_by_hand():
     np.testing.assert_allclose(jit(huber)(jnp.array([0.5, -3.0])), [0.125, 2.5])
 
 
+def same_and_alone_in_the_first(ours, theirs, x):
+    """Two losses and their gradients are the same, and a gradient flows into the first argument alone."""
+    floats = [x[n] for n in ("q_logits_tm1", "r_t", "discount_t", "q_logits_slow_t", "q_selector_t")]
+    run = jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
+    (losses, grads), reference = run(floats, x["a_tm1"])
+    close((losses, grads), reference)
+    assert np.any(grads[0])
+    for gradient in grads[1:]:
+        assert not np.any(gradient)
+
+
 def test_categorical_q_learning_is_rlax_categorical_double_q_learning():
     x = transitions()
-    names = ("q_logits_tm1", "r_t", "discount_t", "q_logits_slow_t", "q_selector_t")
     atoms = jnp.asarray(x["atoms"])
     ours = lambda q, r, d, slow, sel, a: categorical_q_learning(q, atoms, a, r, d, slow, sel)  # noqa: E731
     theirs = lambda q, r, d, slow, sel, a: rlax.categorical_double_q_learning(  # noqa: E731
         atoms, q, a, r, d, atoms, slow, sel
     )
-    run = jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
-    (losses, grads), reference = run([x[n] for n in names], x["a_tm1"])
-    close((losses, grads), reference)
-    assert np.any(grads[0])
-    for gradient in grads[1:]:
-        assert not np.any(gradient)
+    same_and_alone_in_the_first(ours, theirs, x)
 
 
 def test_categorical_q_learning_selecting_for_itself_is_rlax_categorical_q_learning():
@@ -164,7 +169,6 @@ def test_categorical_q_learning_by_hand():
 @pytest.mark.parametrize("kappa", [0.5, 1.0, 2.0])
 def test_quantile_q_learning_is_rlax_quantile_q_learning(kappa):
     x = transitions()
-    names = ("q_logits_tm1", "r_t", "discount_t", "q_logits_slow_t", "q_selector_t")
     shares = (jnp.arange(ATOMS) + 0.5) / ATOMS
 
     def ours(q, r, d, slow, selector, a):
@@ -173,12 +177,7 @@ def test_quantile_q_learning_is_rlax_quantile_q_learning(kappa):
     def theirs(q, r, d, slow, selector, a):  # [M, A]; a distribution of one number is its own mean
         return rlax.quantile_q_learning(q.T, shares, a, r, d, selector[None], slow.T, kappa)
 
-    run = jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
-    (losses, grads), reference = run([x[n] for n in names], x["a_tm1"])
-    close((losses, grads), reference)
-    assert np.any(grads[0])
-    for gradient in grads[1:]:
-        assert not np.any(gradient)
+    same_and_alone_in_the_first(ours, theirs, x)
 
 
 def test_quantile_q_learning_by_hand():
