@@ -182,6 +182,12 @@ def check_size(name: str, value: int, least: int = 1) -> None:
         raise ValueError(f"{name} must be at least {least} and at most {MOST_UNITS}")
 
 
+def check_choice(name: str, value: str, choices: Iterable[str]) -> None:
+    """Raises ValueError where an option's value is none of those that it may have."""
+    if value not in choices:
+        raise ValueError(f"{name}: {choices_text(value, choices)}")
+
+
 def split(text: str) -> tuple[str, dict[str, str]]:
     """Cuts `name:key=value,...` into the name and the texts of its options; knows no registry.
 

@@ -119,6 +119,15 @@ class Context(NamedTuple):
         return cls(encoder.features, num_actions, encoder.make_decoder or no_decoder, encoder.map_shape)
 
 
+def no_other_window(window: Window) -> Latents:
+    """`Latents.of` where latents do not come from windows.
+
+    Raises:
+        ValueError: always.
+    """
+    raise ValueError("these latents are not those of a window")
+
+
 class Latents(NamedTuple):
     """The latents of a window's observations under the online and the slow encoder.
 
@@ -132,10 +141,14 @@ class Latents(NamedTuple):
     offset that a list holds twice. But an offset alone and the same offset in a list are both encoded, and
     so are the offsets that two different lists share: what one objective asks for never changes the
     roundings of what another one sees.
+
+    `of(window)` are the latents of another window under the same encoders: of a view of this one, say, that
+    an objective has drawn with its own key. What it encodes is nobody else's.
     """
 
     online: Callable[[Offsets], jax.Array]
     slow: Callable[[Offsets], jax.Array]
+    of: Callable[[Window], Latents] = no_other_window
 
 
 class Objective(NamedTuple):

@@ -4,6 +4,7 @@ import dataclasses
 import math
 import zlib
 from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -312,7 +313,8 @@ def make_losses(
                 view, online, opens = rl_view, rl_seen, mode.rl_trains_encoder
             own = state.slow.get(name, {"encoder": {}, "head": None})
             lagged = own["encoder"] if jax.tree.leaves(own["encoder"]) else params["encoder"]
-            latents = Latents(online, frozen(encoded(encoder, lagged, view)))
+            of = partial(make_latents, encoder, params["encoder"], lagged)
+            latents = Latents(online, frozen(encoded(encoder, lagged, view)), of)
             losses[name], metrics[name] = objective.loss(
                 params[name],
                 own["head"],
@@ -383,7 +385,8 @@ def shift(window: Window, key: Array) -> Window:
 
 def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window) -> Latents:
     """Latents of a window under two encoders' parameters; none with gradient under the slow ones."""
-    return Latents(encoded(encoder, params, window), frozen(encoded(encoder, slow, window)))
+    of = partial(make_latents, encoder, params, slow)
+    return Latents(encoded(encoder, params, window), frozen(encoded(encoder, slow, window)), of)
 
 
 def encoded(encoder: Encoder, params: Params, window: Window) -> Callable[[Offsets], jax.Array]:
@@ -428,7 +431,7 @@ def frozen(latent: Callable[[Offsets], jax.Array]) -> Callable[[Offsets], jax.Ar
 
 def shut(latents: Latents) -> Latents:
     """The same latents without gradient: an objective that does not train the encoder."""
-    return Latents(frozen(latents.online), latents.slow)
+    return Latents(frozen(latents.online), latents.slow, lambda window: shut(latents.of(window)))
 
 
 def make_act(encoder: Encoder, q_values: Callable, *, noisy: bool) -> Callable:

@@ -28,22 +28,27 @@ def action_cross_entropy(logits: Array, a_tm1: Array) -> jax.Array:
     return -jax.nn.log_softmax(logits)[a_tm1]
 
 
-def inverse(context: Context, *, weight: float = 1.0, hidden: int = 256) -> Objective:
-    """Predicts a_t from z_t and z_{t+1} (thesis, section 3.2; Pathak et al. 2017, equation 2).
+def inverse(context: Context, *, weight: float = 1.0, hidden: int = 256, steps: int = 1) -> Objective:
+    """Predicts a_t from z_t and z_{t+steps} (thesis, section 3.2.3; Pathak et al. 2017, equation 2).
 
     The gradient flows into the head and, through both latents, into the encoder.
 
+    Args:
+        hidden: width of the head's hidden layer.
+        steps: how many steps apart the latents are; rows whose episode ends between them count 0.
+
     Raises:
-        ValueError: where hidden is out of range.
+        ValueError: where an option is out of range.
     """
     check_size("hidden", hidden)
+    check_size("steps", steps)
     network = InverseHead(context.num_actions, hidden)
     z = jnp.zeros((1, context.features))
 
     def loss(head, slow_head, latents: Latents, window: Window, key):
-        logits: Any = network.apply({"params": head}, latents.online(0), latents.online(1))
+        logits: Any = network.apply({"params": head}, latents.online(0), latents.online(steps))
         losses = jax.vmap(action_cross_entropy)(logits, window.actions[:, 0])
         correct = jnp.mean(jnp.argmax(logits, -1) == window.actions[:, 0])
-        return window.valid[:, 0] * losses, {"accuracy": jax.lax.stop_gradient(correct)}
+        return window.valid[:, steps - 1] * losses, {"accuracy": jax.lax.stop_gradient(correct)}
 
-    return Objective(lambda key: network.init(key, z, z)["params"], loss, weight, horizon=1)
+    return Objective(lambda key: network.init(key, z, z)["params"], loss, weight, horizon=steps)

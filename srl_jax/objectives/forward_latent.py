@@ -1,0 +1,79 @@
+"""Self-prediction: the latents of the next steps from the latent and the actions, without pixels."""
+
+import flax.linen as nn
+import jax
+
+from srl_jax.objectives.networks import DISTANCES, MLP, functions, join, one_hot
+from srl_jax.specs import check_choice, check_size
+from srl_jax.types import Array, Context, Latents, Objective, Params, Window
+from srl_jax.update import ema
+
+TARGETS = ("slow", "stopped", "gradient")
+
+
+class LatentDynamics(nn.Module):
+    """A latent and a one-hot action -> the next latent: float32 [B, D], [B, A] -> [B, D].
+
+    Attributes:
+        hidden: width of its hidden layer; 0 makes it linear.
+        residual: whether it predicts the change of the latent.
+    """
+
+    hidden: int
+    residual: bool
+
+    @nn.compact
+    def __call__(self, z: Array, action: Array) -> Array:
+        step = MLP(self.hidden, z.shape[-1])(join(z, action))
+        return z + step if self.residual else step
+
+
+def forward_latent(
+    context: Context,
+    *,
+    weight: float = 1.0,
+    steps: int = 1,
+    hidden: int = 512,
+    residual: bool = False,
+    distance: str = "squared",
+    target: str = "slow",
+    tau: float = 0.99,
+) -> Objective:
+    """Predicts z_{t+1}, ..., z_{t+steps} from z_t and the actions (thesis, sections 3.2.2 and 7.3).
+
+    The dynamics are unrolled in the latent, and the loss is the mean over the steps of the distance to the
+    target; steps behind the end of an episode count 0. The gradient flows through z_t and, with
+    `target=gradient` alone, through the targets.
+
+    Args:
+        steps: how many latents are predicted.
+        hidden: width of the dynamics' hidden layer; 0 for linear dynamics (Tang et al. 2023, equation 3).
+        residual: whether the dynamics predict the change.
+        distance: "squared", a mean over D, or "cosine", `2 - 2 cos`.
+        target: "slow", the latents of a slow copy of the encoder (Ni et al. 2024, section 4); "stopped", the
+            online encoder's, without gradient; "gradient", the online encoder's with gradient, whose least
+            loss is where all latents are the same: it is there to show that they collapse.
+        tau: of the slow copy, see `srl_jax.update.ema`.
+
+    Raises:
+        ValueError: where an option is out of range.
+    """
+    check_size("steps", steps)
+    check_size("hidden", hidden, least=0)
+    check_choice("distance", distance, DISTANCES)
+    check_choice("target", target, TARGETS)
+    init, apply = functions(LatentDynamics(hidden, residual), context.features, context.num_actions)
+    between = jax.vmap(DISTANCES[distance])
+
+    def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
+        ahead = [k + 1 for k in range(steps)]
+        targets = latents.slow(ahead) if target == "slow" else latents.online(ahead)
+        if target == "stopped":
+            targets = jax.lax.stop_gradient(targets)
+        z, losses = latents.online(0), 0.0
+        for k in range(steps):
+            z = apply(head, z, one_hot(window.actions[:, k], context.num_actions))
+            losses += window.valid[:, k] * between(z, targets[k])
+        return losses / steps, {}
+
+    return Objective(init, loss, weight, horizon=steps, slow=ema(tau) if target == "slow" else None)

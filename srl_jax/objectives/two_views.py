@@ -1,0 +1,156 @@
+"""Two views of one observation: BYOL, VICReg and Barlow Twins."""
+
+import jax
+import jax.numpy as jnp
+
+from srl_jax.augment import make_view
+from srl_jax.objectives.networks import MLP, cosine_distance, functions
+from srl_jax.specs import check_size
+from srl_jax.types import Array, Context, Latents, Objective, Params, Window
+from srl_jax.update import ema
+
+
+def byol(
+    context: Context,
+    *,
+    weight: float = 1.0,
+    hidden: int = 512,
+    outputs: int = 128,
+    view: str = "shift+intensity",
+    tau: float = 0.99,
+) -> Objective:
+    """Predicts one view's projection from the other's (Grill et al. 2020, section 3.1, equation 2).
+
+    The mean of `2 - 2 cos(q(p(z)), p'(z'))` over both ways round; z and z' are the latents of two views of
+    s_t, the second under slow copies of encoder and projection. The gradient flows into projection p and
+    predictor q, and through z into the encoder.
+
+    Args:
+        hidden: width of the hidden layer of projection and predictor.
+        outputs: size of a projection.
+        view: see `srl_jax.augment.make_view`.
+        tau: of the slow copies, see `srl_jax.update.ema`.
+
+    Raises:
+        ValueError: where an option is out of range.
+    """
+    check_size("hidden", hidden)
+    check_size("outputs", outputs)
+    draw = make_view(view)
+    init_project, project = functions(MLP(hidden, outputs), context.features)
+    init_predict, predict = functions(MLP(hidden, outputs), outputs)
+
+    def init(key: jax.Array) -> Params:
+        first, second = jax.random.split(key)
+        return {"projection": init_project(first), "predictor": init_predict(second)}
+
+    def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
+        one, other = (latents.of(draw(window, k)) for k in jax.random.split(key))
+
+        def between(seen: Latents, wanted: Latents) -> jax.Array:
+            prediction = predict(head["predictor"], project(head["projection"], seen.online(0)))
+            target = jax.lax.stop_gradient(project(slow_head["projection"], wanted.slow(0)))
+            return jax.vmap(cosine_distance)(prediction, target)
+
+        return (between(one, other) + between(other, one)) / 2, {}
+
+    return Objective(init, loss, weight, slow=ema(tau))
+
+
+def variance_loss(z: Array) -> jax.Array:
+    """`mean_d max(0, 1 - std_d)` over the batch: float32 [B, D] -> [] (Bardes et al. 2022, equation 1)."""
+    return jnp.mean(jax.nn.relu(1 - jnp.sqrt(jnp.var(z, 0, ddof=1) + 1e-4)))
+
+
+def covariance_loss(z: Array) -> jax.Array:
+    """The squares of the covariances of different features, summed, over D: float32 [B, D] -> float32 [].
+
+    Bardes et al. (2022), equations 3 and 4.
+    """
+    centred = z - jnp.mean(z, 0)
+    covariance = centred.T @ centred / (len(z) - 1)
+    return jnp.sum((covariance * (1 - jnp.eye(z.shape[-1]))) ** 2) / z.shape[-1]
+
+
+def vicreg(
+    context: Context,
+    *,
+    weight: float = 1.0,
+    hidden: int = 512,
+    outputs: int = 128,
+    invariance: float = 25.0,
+    variance: float = 25.0,
+    covariance: float = 1.0,
+    view: str = "shift+intensity",
+) -> Objective:
+    """Two views alike, features varied and uncorrelated (Bardes et al. 2022, equation 6). No slow copy.
+
+    The gradient flows into the expander and, through the latents of both views, into the encoder.
+
+    Args:
+        hidden, outputs: width of the expander's hidden layer and size of what it gives.
+        invariance, variance, covariance: factors of the three terms: lambda, mu and nu.
+        view: see `srl_jax.augment.make_view`.
+
+    Raises:
+        ValueError: where an option is out of range.
+    """
+    check_size("hidden", hidden, least=0)
+    check_size("outputs", outputs)
+    draw = make_view(view)
+    init, expand = functions(MLP(hidden, outputs), context.features)
+
+    def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
+        z = [expand(head, latents.of(draw(window, k)).online(0)) for k in jax.random.split(key)]
+        alike = jnp.mean((z[0] - z[1]) ** 2, -1)
+        varied = sum(map(variance_loss, z))
+        apart = sum(map(covariance_loss, z))
+        metrics = {"invariance": jnp.mean(alike), "variance": varied, "covariance": apart}
+        losses = invariance * alike + variance * varied + covariance * apart
+        return losses, jax.lax.stop_gradient(metrics)
+
+    return Objective(init, loss, weight)
+
+
+def cross_correlation(z: Array, other: Array) -> jax.Array:
+    """Pearson's correlation over the batch of each pair of features: [B, D], [B, D] -> float32 [D, D]."""
+    z, other = ((x - jnp.mean(x, 0)) / jnp.sqrt(jnp.var(x, 0) + 1e-5) for x in (z, other))
+    return z.T @ other / len(z)
+
+
+def barlow(
+    context: Context,
+    *,
+    weight: float = 1.0,
+    hidden: int = 512,
+    outputs: int = 128,
+    redundancy: float = 0.005,
+    view: str = "shift+intensity",
+) -> Objective:
+    """Correlations of two views' features are those of the identity (Zbontar et al. 2021, equation 1).
+
+    `sum_d (1 - C_dd)^2 + redundancy sum_{d != e} C_de^2`, the same for every row of the batch, whose mean it
+    is. No slow copy. The gradient flows into the projection and, through both latents, into the encoder.
+
+    Args:
+        hidden, outputs: width of the projection's hidden layer and size of what it gives.
+        redundancy: lambda.
+        view: see `srl_jax.augment.make_view`.
+
+    Raises:
+        ValueError: where an option is out of range.
+    """
+    check_size("hidden", hidden, least=0)
+    check_size("outputs", outputs)
+    draw = make_view(view)
+    init, project = functions(MLP(hidden, outputs), context.features)
+
+    def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
+        first, second = (project(head, latents.of(draw(window, k)).online(0)) for k in jax.random.split(key))
+        correlation = cross_correlation(first, second)
+        identity = jnp.eye(outputs)
+        factor = identity + redundancy * (1 - identity)
+        total = jnp.sum(factor * (correlation - identity) ** 2)
+        return jnp.full(len(first), total), {}
+
+    return Objective(init, loss, weight)
