@@ -24,11 +24,12 @@ from srl_jax.data import published, reference_policies
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
 
-from . import collect, curves, packing, plots, sweep
+from . import collect, curves, packing, plots
 from . import flags as config_flags
 from .arms import FIGURES, Figure, figures_named
 from .collect import RunData, comparable, steps_and_returns
 from .colours import styles
+from .sweeping import launching, manifest, options, status
 from .sweeping.plan import Arm, Planned, parse_seeds, plan
 
 FLAGS = flags.FLAGS
@@ -222,8 +223,7 @@ def _plain(values: Any) -> Any:
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    config_flags.define_config_flags(values)
-    config_flags.define_runtime_flag(values)
+    options.define_flags(values)
     flags.DEFINE_string(
         "figure",
         None,
@@ -233,7 +233,6 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_list("games", ["Pong"], "to run each arm on; a panel each", flag_values=values)
     flags.DEFINE_string("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,", flag_values=values)
     flags.DEFINE_string("out", "runs/figures", "directory of runs and figures", flag_values=values)
-    sweep.define_launcher_flags(values)
     flags.DEFINE_string(
         "published",
         "Human,Dopamine Rainbow",
@@ -269,32 +268,33 @@ def run(values: flags.FlagValues) -> int:
         raise ConfigError(
             f"--out={out}: its runs are packed; draw them with --redraw, or name another directory"
         )
-    options = sweep.launcher_options(values)
+    how = options.launcher_options(values)
     seeds, games = (
         parse_seeds(values["seeds"].value),
         envs.several(values["games"].value, others=bool(values["import"].value)),
     )
-    runs = planned(figures, games, seeds, sweep.given_flags(values))
-    sweep.say_what_is_replaced(values, runs)
+    runs = planned(figures, games, seeds, options.given_flags(values))
+    options.say_what_is_replaced(values, runs)
     methods = _known(values["published"].value)
     if values["dry_run"].value:
-        display.result("\n".join(sweep.dry_run(root, runs, **options)))
+        workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
+        display.result("\n".join(status.dry_run(root, manifest.resolve(runs), workers)))
         return 0
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
-    status = 0
+    code = 0
     try:
         if not values["redraw"].value:
-            status = sweep.run_sweep(root, runs, **options).status
-            if status >= 128:  # told to end
-                return status
+            code = launching.run_sweep(root, manifest.resolve(runs), **how)
+            if code >= 128:  # told to end
+                return code
         read = collect.load_named(root, [run.name for run in runs])
-        how = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
+        asked = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
         for figure in figures:
-            print(write(figure, read, games, root / "figures", **how))
+            print(write(figure, read, games, root / "figures", **asked))
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error
-    return status
+    return code
 
 
 def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directory: Path, **how: Any) -> Path:

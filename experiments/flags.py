@@ -6,6 +6,7 @@ Entry points define their flags with these functions; the library defines none. 
 import functools
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -352,6 +353,7 @@ def parse(
         fail("--flagfile: not taken; write the flags themselves, or use --preset")
     # Else an argument without a name would end the flags.
     values.set_gnu_getopt(positional is not None)
+    own = help.own_flags(values)
     try:
         rest = values(argv)
         if positional and len(rest) > 1 and not values[positional].present:
@@ -359,11 +361,15 @@ def parse(
             values[positional].parse(rest[1:] if several else rest[1])
             del rest[1 : None if several else 2]
     except flags.UnrecognizedFlagError as error:
-        fail(f"--{error.flagname}: {unknown(error.flagname, values)}")
+        fail(f"--{error.flagname}: {unknown(error.flagname, own)}")
     except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
-        fail(str(error).removeprefix("flag "))
+        line = str(error).removeprefix("flag ")
+        several = re.match(r"--(\w+=[^:\s]+,[^:\s]+): ", line)
+        fail(line + (f"; --grid {several[1]} tries each" if several and "grid" in values else ""))
     for name in values:
         flag = values[name]
+        if flag.present and name not in own:
+            fail(f"--{name}: {unknown(name, own)}")
         if flag.present > 1 and not isinstance(flag, flags.MultiFlag):  # absl takes the last one
             hint = "separate values with commas" if isinstance(flag.value, list) else "give it once"
             fail(f"--{name}: given {flag.present} times; {hint}")

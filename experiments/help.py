@@ -49,7 +49,7 @@ def text(about: str, values: flags.FlagValues) -> str:
         about: what the program does; its first lines are shown.
         values: where its flags are defined. Where --rl is among them, jax is imported for what it may be.
     """
-    own = sorted(n for n in values if not values.find_module_defining_flag(n, "absl").startswith("absl"))
+    own = own_flags(values)
     trains = "rl" in own
     grouped = {title: names.split() for title, names in GROUPS.items()} if trains else {}
     known = {name for names in grouped.values() for name in names}
@@ -63,6 +63,11 @@ def text(about: str, values: flags.FlagValues) -> str:
     if trains:
         lines += ["Presets:", *_presets()]
     return "\n".join(lines).rstrip()
+
+
+def own_flags(values: flags.FlagValues) -> list[str]:
+    """The names of a program's flags, sorted; those that absl has brought along are none of its own."""
+    return sorted(n for n in values if not values.find_module_defining_flag(n, "absl").startswith("absl"))
 
 
 def _flag(name: str, values: flags.FlagValues) -> Iterator[str]:

@@ -10,7 +10,6 @@ import sys
 
 import pytest
 
-from experiments.sweeping import launching, table
 from srl_jax import display
 from srl_jax.display import Display
 from srl_jax.errors import SaveError
@@ -67,16 +66,12 @@ def test_letters_that_a_stream_does_not_know_are_escaped():
 
 
 @pytest.mark.parametrize("after", range(6))
-def test_progress_and_tables_go_on_without_their_readers(after, tmp_path):
+def test_progress_goes_on_without_its_reader(after):
     clock = iter(range(0, 1000, 10)).__next__
     with Progress(10, stream=Gone(after), clock=clock, width=80) as progress:
         for done in range(4):
             progress.update(done)
             progress.note("a line")
-    screen = table.Screen(tmp_path, {}, 1, stream=Gone(after), clock=clock)
-    for _ in range(3):
-        screen.update(launching.View([], {}, [], {}, {}, {}))
-        screen.note("a line")
 
 
 def test_progress_without_stderr_shows_nothing(monkeypatch):

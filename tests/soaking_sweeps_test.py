@@ -19,7 +19,7 @@ def _said(line):
 def pair(tmp_path):
     found = [Sweep(tmp_path / name).acts() for name in ("alone", "other")]
     for stubs in found:
-        assert stubs.run().status == 0
+        assert stubs.run() == 0
     return [stubs.root for stubs in found]
 
 

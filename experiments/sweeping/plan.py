@@ -245,13 +245,14 @@ def parse_seeds(text: str, flag: str = "seeds") -> list[int]:
     return list(range(numbers[0])) if len(parts) == 1 else numbers
 
 
-def settings(run: Planned) -> list[str]:
-    """The flags of a run's settings, but for the runs that it starts from."""
+def settings(run: Planned, root: str | os.PathLike = "") -> list[str]:
+    """The flags of a run's settings; what it starts from lies under the sweep's root."""
     found = [f"--preset={run.preset}"]
     for name, value in run.flags.items():
         values = value if isinstance(value, tuple) else (value,)
         found += [f"--{name}={text}" for text in values or ("none",)]
-    return found
+    sources = {"encoder_from": run.encoder_from, "policy_from": run.policy_from}
+    return found + [f"--{flag}={os.path.join(root, name)}" for flag, name in sources.items() if name]
 
 
 def command(run: Planned, root: str | os.PathLike = "") -> list[str]:
@@ -259,11 +260,8 @@ def command(run: Planned, root: str | os.PathLike = "") -> list[str]:
 
     Args:
         run: of a sweep.
-        root: the sweep's; empty for a process that works there. Launchers do that: config.json then names
-            what a run starts from as it lies under the root, wherever that is.
+        root: the sweep's; empty for a process that works there. A sweep's processes do: config.json then
+            names what a run starts from as it lies under the root, wherever that is.
     """
-    found = [sys.executable, "-m", f"{PACKAGE}.train", *settings(run)]
-    for flag in SOURCES:
-        if source := getattr(run, flag):
-            found.append(f"--{flag}={os.path.join(root, source)}")
-    return [*found, f"--out={os.path.join(root, run.name)}", "--resume=auto"]
+    train = [sys.executable, "-m", f"{PACKAGE}.train"]
+    return [*train, *settings(run, root), f"--out={os.path.join(root, run.name)}", "--resume=auto"]
