@@ -6,6 +6,7 @@ import sys
 import pytest
 from absl import flags
 
+from experiments import flags as config_flags
 from experiments import help, sweep, train
 from experiments.cli import COMMANDS
 from experiments.presets import PIECES, PIECES_HELP, PRESETS
@@ -61,6 +62,18 @@ def test_every_preset_has_a_line():
 def test_a_programs_own_flags_come_first():
     page = _text(sweep)
     assert page.index("\nFlags:\n") < page.index("  --grid") < page.index("\nRun:\n")
+
+
+@pytest.mark.parametrize("given", ["--verbosity=1", "--verbosit=1"])
+def test_flags_that_absl_brings_along_are_neither_taken_nor_suggested(given, capsys):
+    values = flags.FlagValues()
+    train.define_flags(values)
+    of_absl = flags.Flag(flags.IntegerParser(), None, "verbosity", 0, "of logging")
+    flags.DEFINE_flag(of_absl, values, module_name="absl.logging")
+    with pytest.raises(SystemExit):
+        config_flags.parse(["train", given], values)
+    name = given.partition("=")[0]
+    assert capsys.readouterr().err == f"error: {name}: no such flag; --help lists them all\n"
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -32,11 +32,12 @@ def test_time_left_by_hand():
     runs = entries(b="a", a="", c="")
     # a: 500 steps at 10/s are 50 s; b, which starts from it: 1000 at 20/s, 50 s; c: 1000 at 50/s, 20 s.
     per_s = {"a": 10.0, "b": 20.0, "c": 50.0}
-    assert seconds_left(runs, {"a": 500}, per_s, 1) == (120.0, 0)
+    steps = {"a": 500, "b": 1000, "c": 1000}
+    assert seconds_left(runs, steps, per_s, 1) == (120.0, 0)
     # Two at once: 60 s of work each, but b cannot begin before a has ended.
-    assert seconds_left(runs, {"a": 500}, per_s, 2) == (100.0, 0)
-    assert seconds_left(runs, {"a": 500}, per_s, 2, ["a", "b"]) == (20.0, 0)
-    assert seconds_left(runs, {}, {"a": None, "c": 50.0}, 2) == (20.0, 2)
+    assert seconds_left(runs, steps, per_s, 2) == (100.0, 0)
+    assert seconds_left(runs, {"c": 1000}, per_s, 2) == (20.0, 0)
+    assert seconds_left(runs, steps, {"a": None, "b": None, "c": 50.0}, 2) == (20.0, 2)
 
 
 def test_progress_is_read_from_the_end(tmp_path):

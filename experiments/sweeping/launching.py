@@ -105,12 +105,13 @@ def run_sweep(
     root = root.absolute()
     rundir.check_free(root)
     planned = manifest.read(root) | entries
+    executor: cf.Executor
     memory = None
     if launcher == "ray":
         from .ray_executor import Ray
 
-        executor = Ray(cpus_per_run, gpus_per_run, retries, ray_address)
-        at_once = lambda: workers or executor.capacity()  # noqa: E731
+        executor = cluster = Ray(cpus_per_run, gpus_per_run, retries, ray_address)
+        at_once = lambda: workers or cluster.capacity()  # noqa: E731
     else:
         count = workers or most_workers(cpus_per_run)
         executor, at_once = cf.ThreadPoolExecutor(count), lambda: count
@@ -368,7 +369,7 @@ def own_cores(count: int, folder: Path | None = None) -> Iterator[list[int]]:
     """
     affinity = getattr(os, "sched_getaffinity", lambda pid: ())
     all_cores = [] if runtime.has_gpu(os.environ) else affinity(0)
-    folder = folder or Path(tempfile.gettempdir()) / f"srl_jax-cores-{os.getuid()}"
+    folder = folder or Path(tempfile.gettempdir()) / f"srl_jax-{os.getuid()}" / "cores"
     with contextlib.ExitStack() as locks:
         with _lending:
             least_used = sorted(all_cores, key=lambda core: (_lent[core], core))

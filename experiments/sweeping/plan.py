@@ -130,11 +130,13 @@ def plan(
     Raises:
         ConfigError: a name is unknown, or two runs would have the same one.
     """
-    flags = _checked("", flags or {})
+    flags = _checked(flags or {})
     by_name: dict[str, Arm] = {}
     for arm in arms:
-        _check(arm)
-        arm = arm._replace(flags=_checked(f"arm {arm.name}: ", arm.flags))
+        try:
+            arm = _checked_arm(arm)
+        except ConfigError as error:
+            raise ConfigError(f"arm {arm.name}: {error}") from None
         if by_name.setdefault(arm.name, arm) != arm:
             raise ConfigError(
                 f"arm {arm.name}: there twice, of {by_name[arm.name].preset} and of {arm.preset}; "
@@ -178,23 +180,20 @@ def plan(
     return list(runs.values())
 
 
-def _check(arm: Arm) -> None:
-    try:
-        parts(arm.preset)
-    except ConfigError as error:
-        raise ConfigError(f"arm {arm.name}: {error}") from None
-    plain = arm.name.replace("_", "").replace("-", "").replace(".", "").replace("=", "")
-    if not (plain.isascii() and plain.isalnum()) or arm.name.startswith("."):
-        raise ConfigError(f"arm {arm.name}: a name is made of letters, digits and _ - . =")
-    if ".broken-" in arm.name:
-        raise ConfigError(f"arm {arm.name}: .broken- marks what was moved aside; give it another name")
+def _checked_arm(arm: Arm) -> Arm:
+    parts(arm.preset)
+    if not re.fullmatch(r"(?!\.)[A-Za-z0-9_.=-]*[A-Za-z0-9][A-Za-z0-9_.=-]*", arm.name):
+        raise ConfigError("a name is made of letters, digits and _ - . =")
+    if ".broken-" in arm.name:  # `run_data.run_directories` passes over it
+        raise ConfigError(".broken- marks what an earlier version moved aside; give it another name")
+    return arm._replace(flags=_checked(arm.flags))
 
 
-def _checked(where: str, flags: Flags) -> dict[str, str | tuple[str, ...]]:
+def _checked(flags: Flags) -> dict[str, str | tuple[str, ...]]:
     """The flags, with the files that they import named so that a process finds them that works elsewhere."""
     for flag, mine in OWN.items():
         if flag in flags:
-            raise ConfigError(f"{where}--{flag}: a sweep gives it to each run; --{mine} decides it")
+            raise ConfigError(f"--{flag}: a sweep gives it to each run; --{mine} decides it")
     own = dict(flags)
     if "import" in own:
         texts = (own["import"],) if isinstance(own["import"], str) else own["import"]

@@ -8,6 +8,7 @@ have such locks, as NFS 4 does; there, those of a node that is lost go when its 
 """
 
 import concurrent.futures as cf
+import functools
 import importlib.util
 import os
 import socket
@@ -48,19 +49,21 @@ class Ray(cf.Executor):
             variables["JAX_PLATFORMS"] = os.environ.get("JAX_PLATFORMS", "cpu")
         elif gpus < 1:
             variables["XLA_PYTHON_CLIENT_MEM_FRACTION"] = f"{0.9 * gpus:.3f}"
-        options = {} if address else {"object_store_memory": STORE_BYTES, "include_dashboard": False}
+        own = {} if address else {"object_store_memory": STORE_BYTES, "include_dashboard": False}
         try:
             ray.init(
                 address or "local",
                 log_to_driver=False,
                 logging_level="ERROR",
                 runtime_env={"env_vars": variables},
-                **options,
+                **own,
             )
         except (ConnectionError, ValueError, RuntimeError) as error:
             line = str(error).strip().split("\n")[0]
             raise ConfigError(f"--ray_address={address}: no Ray cluster: {line}") from None
-        self.ray, self.cpus, self.gpus, self.retries = ray, cpus, gpus, retries
+        self.ray, self.cpus, self.gpus = ray, cpus, gpus
+        options = {"num_cpus": cpus, "num_gpus": gpus, "max_retries": retries, "retry_exceptions": False}
+        self.remote = functools.cache(lambda function: ray.remote(function).options(**options))
         if not self.capacity():
             self.shutdown()
             raise ConfigError(
@@ -68,10 +71,7 @@ class Ray(cf.Executor):
             )
 
     def submit(self, function: Callable[..., Any], /, *args: Any) -> cf.Future:
-        task = self.ray.remote(function).options(
-            num_cpus=self.cpus, num_gpus=self.gpus, max_retries=self.retries, retry_exceptions=False
-        )
-        return task.remote(*args).future()
+        return self.remote(function).remote(*args).future()
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
         self.ray.shutdown()

@@ -5,7 +5,7 @@ import json
 import math
 import os
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -111,11 +111,7 @@ def _published() -> Iterator[tuple[Config, Progress]]:
 
 
 def seconds_left(
-    entries: Mapping[str, Entry],
-    reached: Mapping[str, int],
-    per_s: Mapping[str, float | None],
-    workers: int,
-    without: Collection[str] = (),
+    entries: Mapping[str, Entry], steps: Mapping[str, int], per_s: Mapping[str, float | None], workers: int
 ) -> tuple[float, int]:
     """The time until all runs are complete, if none stops early.
 
@@ -124,27 +120,20 @@ def seconds_left(
 
     Args:
         entries: {name: Entry}.
-        reached: {name: env steps}; missing ones have none.
+        steps: {name: env steps that are left}; none of those that nobody waits for.
         per_s: {name: env steps a second}; None where unknown.
         workers: runs at once.
-        without: names of runs that nobody waits for.
 
     Returns:
         Seconds, and the number of runs that it does not count because their speed is not known.
     """
-    left, unknown = dict.fromkeys(entries, 0.0), 0
-    for name, (_, config) in entries.items():
-        steps = 0 if name in without else max(config.steps - reached.get(name, 0), 0)
-        rate = per_s.get(name)
-        if rate:
-            left[name] = steps / rate
-        elif steps:
-            unknown += 1
+    left = {name: n / rate for name, n in steps.items() if (rate := per_s[name])}
     chains: dict[str, float] = {}
     order = graphlib.TopologicalSorter({name: entry.run.sources for name, entry in entries.items()})
     for name in order.static_order():
         sources = entries[name].run.sources
-        chains[name] = left[name] + max((chains[source] for source in sources), default=0.0)
+        chains[name] = left.get(name, 0.0) + max((chains[source] for source in sources), default=0.0)
+    unknown = sum(1 for name, n in steps.items() if n and not per_s[name])
     return max(sum(left.values()) / max(workers, 1), max(chains.values(), default=0.0)), unknown
 
 
@@ -201,10 +190,13 @@ def lines(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
     kinds = ("running", "waiting", "failed", "blocked")
     parts += [f"{counts[kind]} {kind}" for kind in kinds if counts[kind]]
     if counts["running"] or counts["waiting"]:
-        over = [name for name, (kind, _) in seen.items() if kind not in ("running", "waiting")]
-        reached = {name: progress(root / name).env_steps for name in seen}
+        steps = {
+            name: max(entries[name].config.steps - progress(root / name).env_steps, 0)
+            for name, (kind, _) in seen.items()
+            if kind in ("running", "waiting")
+        }
         at_once = counts["running"] or workers
-        seconds, unknown = seconds_left(entries, reached, rates(root, entries), at_once, over)
+        seconds, unknown = seconds_left(entries, steps, rates(root, entries), at_once)
         parts.append(f"{duration(seconds)} left" if seconds else "time left unknown")
         if seconds and unknown:
             parts[-1] += f" and {unknown} of unknown speed"
@@ -238,31 +230,26 @@ def dry_run(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]
         ConfigError: see `states.look_at_all`.
     """
     found, per_s = states.look_at_all(root, entries), rates(root, entries)
-    done = [name for name, state in found.items() if state.kind == "done"]
     # What a run has beyond its last checkpoint it does again.
-    reached = {name: state.env_steps for name, state in found.items()}
     left = {
-        name: 0 if name in done else max(entry.config.steps - reached[name], 0)
-        for name, entry in entries.items()
+        name: max(entries[name].config.steps - state.env_steps, 0)
+        for name, state in found.items()
+        if state.kind != "done"
     }
     arms: dict[str, list[str]] = {}
     for name in entries:
         arms.setdefault(name.rpartition("/")[0], []).append(name)
     rows = [("arm", "runs", "done", "to run", "env steps", "steps/s", "time")]
     for arm, names in arms.items():
-        complete, steps, rate = (
-            len(set(names) & set(done)),
-            sum(left[name] for name in names),
-            per_s[names[0]],
-        )
-        times = ("unknown", "unknown") if rate is None else (f"{rate:,.0f}", duration(steps / rate))
-        counts = map(str, (len(names), complete, len(names) - complete))
-        rows.append((arm, *counts, f"{steps:,}", *times))
+        todo, rate = [left[name] for name in names if name in left], per_s[names[0]]
+        times = ("unknown", "unknown") if rate is None else (f"{rate:,.0f}", duration(sum(todo) / rate))
+        counts = map(str, (len(names), len(names) - len(todo), len(todo)))
+        rows.append((arm, *counts, f"{sum(todo):,}", *times))
     lines = columns(rows)
     lines += [f"{name}: {state.reason}; would wait" for name, state in found.items() if state.kind == "busy"]
-    seconds, unknown = seconds_left(entries, reached, per_s, workers, done)
-    line = f"{len(entries) - len(done)} of {len(entries)} runs to run, {sum(left.values()):,} env steps"
-    if len(done) < len(entries):
+    seconds, unknown = seconds_left(entries, left, per_s, workers)
+    line = f"{len(left)} of {len(entries)} runs to run, {sum(left.values()):,} env steps"
+    if left:
         line += f", {duration(seconds) if seconds else 'unknown time'} with {workers} at once"
         line += f" and {unknown} runs of unknown speed" if seconds and unknown else ""
     lines.append(line)
