@@ -35,8 +35,9 @@ def main(root, name):
     os.makedirs(name, exist_ok=True)
     lock = os.open(f"{name}/lock", os.O_RDWR | os.O_CREAT)
     fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    with open(f"{name}/config.json", "w") as file:
+    with open(f"{name}/config.json.partial", "w") as file:
         json.dump(about["config"], file)
+    os.replace(f"{name}/config.json.partial", f"{name}/config.json")
     os.pwrite(lock, json.dumps({"pid": os.getpid(), "host": "here", "since": "now"}).encode(), 0)
     if act == "kill":
         os.kill(os.getpid(), signal.SIGKILL)

@@ -103,7 +103,9 @@ def test_runs_are_run_once_and_after_what_they_start_from(stubs, capsys):
         in_root, began[name] = (stubs.root / "stub" / f"{name}.attempts").read_text().split()
         assert in_root == "True"
     assert float(began[C]) > float(began[A])
-    assert f"{C}: done, 500 env steps in 0:00:05, last evaluation 0.5" in capsys.readouterr().err
+    said = capsys.readouterr().err
+    assert f"{C}: done, 500 env steps in 0:00:05, last evaluation 0.5" in said
+    assert said.endswith("sweep: 3 of 3 runs done\n")
     # Again: nothing is left to do.
     before = {p: p.read_bytes() for p in stubs.root.rglob("*") if p.is_file()}
     assert stubs.run() == 0

@@ -176,11 +176,13 @@ def launch(
     bad: dict[str, str] = {}  # {name of one that failed or is blocked: what those say that start from it}
     ready: list[str] = []
     flying: dict[cf.Future[Ended], str] = {}
-    asked, disk, said_at = 0, "", time.monotonic()
+    place, asked, disk, said_at = list(entries), 0, "", time.monotonic()
 
     def room(name: str) -> bool:
+        if memory is None or not flying:
+            return len(flying) < at_once
         taken = sum(run_bytes(entries[other].config) for other in (name, *flying.values()))
-        return not flying or (len(flying) < workers() and (memory is None or taken <= memory))
+        return len(flying) < at_once and taken <= memory
 
     def settled(name: str) -> bool:
         """Whether one that could begin is dealt with."""
@@ -199,27 +201,29 @@ def launch(
     with _asking(root) as ask, signals() as caught:
         try:
             while order.is_active() and (flying or not asked):
-                ready = sorted([*ready, *order.get_ready()], key=list(entries).index)
+                if (times := max(len(caught), asked_to_end(root), int(bool(disk)))) > asked:
+                    why = f"signal {caught[-1]}" if caught else disk or f"{STOP} was taken away"
+                    say(f"stopping: {why}; each run writes a checkpoint")
+                    asked = times
+                    ask(asked)
+                at_once = max(workers(), 1)
+                ready = sorted([*ready, *order.get_ready()], key=place.index)
                 ready = [name for name in ready if not settled(name)]
                 for future in cf.wait(flying, EVERY_S, cf.FIRST_COMPLETED).done:
                     name, (code, reason) = flying.pop(future), _result(future)
                     if code == 0:
                         done.add(name)
                         say(f"{name}: done, {status.ended_text(root / name)}")
-                    elif code == NO_SPACE:
-                        disk = disk or f"{name}: {reason}"
-                    elif reason:
+                    elif code != NO_SPACE and reason:
                         bad[name] = f"{name} failed"
                         say(f"{name}: failed: {reason}")
                         with contextlib.suppress(SaveError):  # of a full disk the runs tell
                             states.note(root, name, f"failed: {reason}")
-                    if code == 0 or name in bad:
-                        order.done(name)
-                if (times := max(len(caught), asked_to_end(root), int(bool(disk)))) > asked:
-                    why = f"signal {caught[-1]}" if caught else disk or f"{STOP} was taken away"
-                    say(f"stopping: {why}; each run writes a checkpoint")
-                    asked = times
-                    ask(asked)
+                    else:
+                        disk = disk or (f"{name}: {reason}" if reason else "")
+                        ready.append(name)
+                        continue
+                    order.done(name)
                 if time.monotonic() - said_at > SUMMARY_EVERY_S:
                     said_at = time.monotonic()
                     say(status.lines(root, entries, workers())[0])
@@ -227,7 +231,7 @@ def launch(
             ask(1)
             cf.wait(flying)  # so that nobody writes on unknown
             raise
-    for line in status.lines(root, entries, workers())[:-1]:
+    for line in status.lines(root, entries, workers()):
         say(line)
     if disk:
         raise SaveError(disk)
@@ -263,7 +267,7 @@ def asked_to_end(root: Path) -> int:
     """How often the runs of a sweep were asked to end."""
     try:
         return 2 - len((root / STOP).read_bytes())
-    except OSError:
+    except FileNotFoundError:
         return 1
 
 

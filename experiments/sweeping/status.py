@@ -1,11 +1,13 @@
 """What one sees of a sweep: how far it is, how long it still takes, which arm did best. Imports no jax."""
 
+import contextlib
+import functools
 import graphlib
 import json
 import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +22,6 @@ from . import states
 from .manifest import Entry
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
-"""Runs that the project has published; for speeds, where a sweep has none of its own."""
 MOST = 12
 """Failed runs that are listed; the others are counted."""
 
@@ -72,12 +73,9 @@ def rates(root: Path, entries: Mapping[str, Entry]) -> dict[str, float | None]:
     """
     own = {name: progress(root / name) for name in entries}
     here = _sums((entry.config, own[name]) for name, entry in entries.items())
-    elsewhere: dict[tuple, tuple[float, float]] | None = None
     found: dict[str, float | None] = {}
     for name, (_, config) in entries.items():
-        if elsewhere is None and _kind(config) not in here:
-            elsewhere = _sums(_published())
-        like = here.get(_kind(config)) or (elsewhere or {}).get(_kind(config))
+        like = here.get(_kind(config)) or _published().get(_kind(config))
         found[name] = own[name].per_s if _timed(config, own[name]) else like and like[0] / like[1]
     return found
 
@@ -100,14 +98,14 @@ def _sums(runs: Iterable[tuple[Config, Progress]]) -> dict[tuple, tuple[float, f
     return found
 
 
-def _published() -> Iterator[tuple[Config, Progress]]:
+@functools.cache
+def _published() -> dict[tuple, tuple[float, float]]:
+    """`_sums` of the runs that the project has published."""
+    runs: list[RunData] = []
     for folder in packing.folders_below(RESULTS):
-        try:
-            for run in packing.read(folder, only_last=True):
-                for row in run.rows[-1:]:
-                    yield run.config, Progress(row["env_steps"], row["wall_s"])
-        except ConfigError:
-            continue
+        with contextlib.suppress(ConfigError):  # of an earlier version
+            runs += packing.read(folder, only_last=True)
+    return _sums((run.config, Progress(run.rows[-1]["env_steps"], run.rows[-1]["wall_s"])) for run in runs)
 
 
 def seconds_left(
