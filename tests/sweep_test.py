@@ -408,6 +408,7 @@ def test_a_sweep_is_resumed_as_it_was_planned_where_no_presets_are_given(tmp_pat
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "name": "../../x"}]}),
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "name": "a/../x"}]}),
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "flags": []}]}),
+        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "policy_from": "a/b/c"}]}),
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "config": {"steps": -1}}]}),
         lambda about: "[" * 100_000,
     ],

@@ -2,7 +2,6 @@
 
 import dataclasses
 import json
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -20,7 +19,6 @@ from .plan import Planned, settings
 FILE = "sweep.json"
 FORMAT = 1
 _LIMIT = 1 << 28  # bytes
-_NAME = re.compile(r"(?!\.+/)[^/]+/(?!\.+/)[^/]+/[^/]*[^/.][^/]*")
 
 
 class Entry(NamedTuple):
@@ -31,7 +29,7 @@ class Entry(NamedTuple):
 
 
 def read(root: Path) -> dict[str, Entry]:
-    """{name: Entry} of the sweep in a directory, sources first; {} where there is none.
+    """{name: Entry} of the sweep in a directory, in the order of the plan; {} where there is none.
 
     Raises:
         ConfigError: it cannot be read.
@@ -41,21 +39,24 @@ def read(root: Path) -> dict[str, Entry]:
         content = parse_json(read_bytes(path, _LIMIT))
         if content["format"] != FORMAT:
             raise ValueError(f"of format {content['format']}, not {FORMAT}")
-        entries = [_entry(**about) for about in content["runs"]]
+        entries = {about["name"]: _entry(**about) for about in content["runs"]}
+        for run, _ in entries.values():
+            if missing := set(run.sources) - entries.keys():
+                raise ValueError(f"{run.name} starts from {missing.pop()}, which is not there")
+        return entries
     except FileNotFoundError:
         return {}
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"{path}: not what a sweep writes: {error!s:.200}") from None
-    return {entry.run.name: entry for entry in entries}
 
 
 def _entry(config: Mapping[str, Any], **about: Any) -> Entry:
     run = Planned(**about)
-    for name in (run.name, *run.sources):
-        if not _NAME.fullmatch(name):
-            raise ValueError(f"{name}: not the name of a run, GAME/ARM/seedN")
+    parts = run.name.split("/")
+    if len(parts) != 3 or not all(part.strip(".") for part in parts):
+        raise ValueError(f"{run.name}: not the name of a run, GAME/ARM/seedN")
     flags = {name: tuple(x) if isinstance(x, list) else x for name, x in run.flags.items()}
     return Entry(run._replace(flags=flags), Config.from_json(json.dumps(config)))
 

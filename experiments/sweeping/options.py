@@ -63,21 +63,14 @@ def launcher_options(values: flags.FlagValues) -> dict[str, Any]:
 
 
 def given_flags(values: flags.FlagValues) -> dict[str, str | tuple[str, ...]]:
-    """The flags of experiments.train that were given, as texts.
-
-    Raises:
-        ConfigError: one is among them that a sweep gives to each run itself.
-    """
+    """The flags of training that were given, as texts; `plan.plan` refuses those that it gives each run."""
     names = [info.flag or name for name, info in INFOS.items()]
     found: dict[str, str | tuple[str, ...]] = {}
     for name in (*names, "preset", "config", "tune_runtime"):
-        if not values[name].present:
-            continue
-        if name in plan.OWN:
-            raise ConfigError(f"--{name}: a sweep gives it to each run; --{plan.OWN[name]} decides it")
-        value = values[name].value
-        text = tuple(value) if isinstance(value, list) else "off" if value is None else value_text(value)
-        found[name] = text
+        if values[name].present:
+            value = values[name].value
+            text = tuple(value) if isinstance(value, list) else "off" if value is None else value_text(value)
+            found[name] = text
     return found
 
 

@@ -127,12 +127,16 @@ def seconds_left(
     """
     left = {name: n / rate for name, n in steps.items() if (rate := per_s[name])}
     chains: dict[str, float] = {}
-    order = graphlib.TopologicalSorter({name: entry.run.sources for name, entry in entries.items()})
-    for name in order.static_order():
+    for name in _sources_first(entries):
         sources = entries[name].run.sources
         chains[name] = left.get(name, 0.0) + max((chains[source] for source in sources), default=0.0)
     unknown = sum(1 for name, n in steps.items() if n and not per_s[name])
     return max(sum(left.values()) / max(workers, 1), max(chains.values(), default=0.0)), unknown
+
+
+def _sources_first(entries: Mapping[str, Entry]) -> Iterable[str]:
+    order = graphlib.TopologicalSorter({name: entry.run.sources for name, entry in entries.items()})
+    return order.static_order()
 
 
 def duration(seconds: float) -> str:
@@ -150,14 +154,13 @@ def columns(rows: Sequence[Sequence[str]]) -> list[str]:
 
 
 def view(root: Path, entries: Mapping[str, Entry]) -> dict[str, tuple[str, str]]:
-    """{name: ("done", "running", "failed", "blocked" or "waiting", which process or why)}, as the files say.
+    """{name: (what it is, which process or why)}, as the files say.
 
-    Args:
-        root: of the sweep.
-        entries: of its manifest, sources first.
+    A run is "done", "running", "failed", "blocked" or "waiting".
     """
     found: dict[str, tuple[str, str]] = {}
-    for name, (run, config) in entries.items():
+    for name in _sources_first(entries):
+        run, config = entries[name]
         try:
             state, why = states.look(root / name, config), states.failure(root, name)
         except ConfigError as error:
@@ -172,7 +175,7 @@ def view(root: Path, entries: Mapping[str, Entry]) -> dict[str, tuple[str, str]]
             found[name] = "blocked", f"{bad[0]} failed" if kind == "failed" else why
         else:
             found[name] = "waiting", state.reason
-    return found
+    return {name: found[name] for name in entries}
 
 
 def lines(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
