@@ -3,8 +3,7 @@
 `python stub_run.py ROOT NAME`, in ROOT. ROOT/stub/NAME.json holds {"config": what config.json is, "acts":
 what the first attempt does, the second, and so on; the last one for all that follow}. Acts: "end" (leaves
 what lies in ROOT/stub/NAME.run), "kill", "exit:N" (prints a line first), "wait" (until SIGTERM), "lie"
-(status 0 without being complete), "slow" (the end, after a while). ROOT/stub/NAME.attempts and .ends have a
-line for each.
+(status 0 without being complete). ROOT/stub/NAME.attempts and .ends have a line for each.
 """
 
 import fcntl
@@ -44,7 +43,7 @@ def main(root, name):
     if act.startswith("exit:"):
         print(f"error: ended on purpose {attempt}")
         return int(act[5:])
-    deadline = time.monotonic() + {"wait": 60.0, "slow": 0.3}.get(act, 0.0)
+    deadline = time.monotonic() + (60.0 if act == "wait" else 0.0)
     while time.monotonic() < deadline and not stopped:
         time.sleep(0.01)
     if stopped:
@@ -57,4 +56,6 @@ def main(root, name):
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1], sys.argv[2]))
+    status = main(sys.argv[1], sys.argv[2])
+    os.unlink(f"{sys.argv[2]}/lock")
+    sys.exit(status)

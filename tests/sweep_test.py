@@ -80,8 +80,8 @@ class Sweep:
         return status.view(self.root, ALL)
 
     def wait_for(self, name, attempts=1):
-        deadline = time.monotonic() + 120
-        while not (self.count()[list(ALL).index(name)] >= attempts and (self.root / name / "lock").exists()):
+        deadline, lock = time.monotonic() + 120, self.root / name / "lock"
+        while self.count()[list(ALL).index(name)] < attempts or not lock.exists() or not lock.read_text():
             assert time.monotonic() < deadline
             time.sleep(0.01)
 
@@ -190,10 +190,17 @@ def test_a_changed_plan_is_merged(stubs):
     assert (stubs.root / "sweep.json").read_bytes() == before
 
 
-def test_a_directory_that_somebody_writes_to_is_waited_for(stubs):
-    other = subprocess.Popen(stubs.acts(b=["slow"]).command(ALL[B].run), cwd=stubs.root)
+def test_a_directory_that_somebody_writes_to_is_waited_for(stubs, capsys):
+    other = subprocess.Popen(stubs.acts(b=["wait", "end"]).command(ALL[B].run), cwd=stubs.root)
     stubs.wait_for(B)
-    assert stubs.run(B) == 0 and other.wait() == 0 and stubs.count()[1] == 1
+    thread, said = threading.Thread(target=stubs.run, args=[B]), ""
+    thread.start()
+    while f"{B}: waiting for process {other.pid} on here" not in said:
+        said += capsys.readouterr().err
+        assert thread.is_alive()
+    other.terminate()
+    thread.join()
+    assert stubs.count() == [0, 2, 0] and stubs.seen()[B][0] == "done" and other.wait() == 143
     with rundir.held(stubs.root), pytest.raises(ConfigError, match="is writing there"):
         stubs.run(A)
 

@@ -285,26 +285,28 @@ def attempt(root: Path, name: str, command: list[str], config: Config, cores: in
         cores, retries: see `run_sweep`.
     """
     try:
-        while (state := states.look(root / name, config)).kind == "busy" and not asked_to_end(root):
+        state, left = states.look(root / name, config), retries
+        if state.kind == "busy":
+            say(f"{name}: waiting for {state.reason}")
+        while state.kind == "busy" and not asked_to_end(root):
             time.sleep(EVERY_S)
-        for left in reversed(range(1 + retries)):
-            if state.kind == "done":
-                return 0, ""
+            state = states.look(root / name, config)
+        while state.kind != "done":
             if asked_to_end(root):
                 return STOPPED, ""
             code, reason = _run(root, name, command, cores)
-            if code == 0:
-                state = states.look(root / name, config)
-                lacks = f"ended with status 0 and is {state.kind} {state.reason}".rstrip()
-                return (0, "") if state.kind == "done" else (1, lacks)
+            state = states.look(root / name, config)
+            if code == 0 and state.kind != "done":
+                return 1, f"ended with status 0 and is {state.kind} {state.reason}".rstrip()
             if code in (BAD_INPUT, NO_SPACE, DIVERGED) or not reason or not left:
                 return code, reason
             say(f"{name}: {reason}; resuming it")
+            left -= 1
     except ConfigError as error:
         return BAD_INPUT, str(error)
     except (OSError, SaveError) as error:
         return NO_SPACE, f"not started: {error}"
-    return STOPPED, ""
+    return 0, ""
 
 
 def _run(root: Path, name: str, command: list[str], cores: int) -> Ended:
@@ -361,8 +363,8 @@ _lending = threading.Lock()
 def own_cores(count: int, folder: Path | None = None) -> Iterator[list[int]]:
     """Numbers of cores for one run: two runs with a core each are together faster than two that share two.
 
-    A core is a lock in the folder for temporary files, for all processes of a user. Where there are too few,
-    runs share cores, but each has as many as it has alone, so that XLA computes alike.
+    Who has a core holds its folder below that for temporary files, so all processes of a user share them.
+    Where there are too few, runs share a core, but each has as many as it has alone: XLA computes alike then.
 
     Args:
         count: how many; at least 1.
