@@ -364,8 +364,10 @@ def parse(
         fail(f"--{error.flagname}: {unknown(error.flagname, own)}")
     except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
         line = str(error).removeprefix("flag ")
-        several = re.match(r"--(\w+=[^:\s]+,[^:\s]+): ", line)
-        fail(line + (f"; --grid {several[1]} tries each" if several and "grid" in values else ""))
+        several = re.match(r"--((\w+)=[^:\s]+,[^:\s]+): ", line)
+        if several and several[2] in INFOS and "grid" in values:
+            line += f"; --grid {several[1]} tries each"
+        fail(line)
     for name in values:
         flag = values[name]
         if flag.present and name not in own:
