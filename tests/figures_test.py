@@ -190,7 +190,8 @@ def test_the_same_runs_give_the_same_bytes(runs, tmp_path):
 
 def test_an_arm_has_one_colour_in_all_figures_of_a_directory_and_on_its_page(runs):
     pytest.importorskip("matplotlib")
-    from experiments.reporting import page
+    from experiments.colours import styles
+    from experiments.reporting import numbers
 
     other = Figure("other", "Other", "?", (FigureArm("b", "catch/joint"), FigureArm("c", "catch/joint")))
     (runs / "Catch/other").rename(runs / "Catch/c")
@@ -198,9 +199,7 @@ def test_an_arm_has_one_colour_in_all_figures_of_a_directory_and_on_its_page(run
     assert among == ["a", "b", "c"]
     first, second = (figures.evaluated(x, read, ["Catch"], among=among)["styles"] for x in (FIGURE, other))
     assert first["b"] == second["b"] and len({tuple(x) for x in (first | second).values()}) == 3
-    options = {"baseline": "b", "reach": {}, "force": True, "finished_only": False, "media": False}
-    report = page.gather([runs], **options)
-    assert {arm: list(style) for arm, style in report.styles.items()} == first | second
+    assert {arm: list(style) for arm, style in styles(numbers.arms_of(read)).items()} == first | second
 
 
 def test_all_figures_share_their_runs():
