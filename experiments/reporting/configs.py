@@ -1,9 +1,10 @@
 """What configurations say: where runs were made, in what arms differ, how policies were evaluated."""
 
+import itertools
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from srl_jax import envs, specs
 from srl_jax.config import INFOS, Config, history
@@ -15,20 +16,6 @@ from ..collect import RunData
 
 THEN = ", then "
 """Between what a run was made by and what it was resumed under."""
-
-
-class Settings(NamedTuple):
-    """The settings of one or several games, whose arms differ in the same.
-
-    Attributes:
-        games: that this is true of.
-        arms: that they have.
-        differing: field -> its value in each arm, where two arms differ.
-    """
-
-    games: list[str]
-    arms: list[str]
-    differing: dict[str, list[str]]
 
 
 def about(run: RunData) -> dict[str, str]:
@@ -51,61 +38,52 @@ def about(run: RunData) -> dict[str, str]:
     return {name: texts[name] for name in [*names, "started"] if texts.get(name)}
 
 
-def settings(runs: Sequence[RunData], arms: Sequence[str]) -> tuple[list[Settings], dict[str, str]]:
+def settings(runs: Sequence[RunData], arms: Sequence[str]) -> tuple[dict[str, dict[str, str]], dict[str, str]]:
     """Every field of the configurations, apart from game and seed; specifications by their options.
 
     Returns:
-        Where arms differ, by game; and field -> value of what all arms of each game share, with a value for
-        each game where games differ.
+        field -> arm -> value, where two arms differ on a game; and field -> value of what they share. Where
+        games differ, a value is that of each game.
     """
-    found: list[Settings] = []
-    shared: dict[str, dict[str, str]] = {}
-    for game, by_arm in collect.grouped(runs).items():
-        here = [arm for arm in arms if arm in by_arm]
-        cells = {arm: [_fields(run.config) for run in by_arm[arm]] for arm in here}
-        names = {name for configs in cells.values() for config in configs for name in config}
-        differing = {}
-        for name in sorted(names, key=_place):
-            values = [", ".join(dict.fromkeys(x.get(name, "–") for x in cells[arm])) for arm in here]
-            if len(set(values)) > 1:
-                differing[name] = values
-            else:
-                shared.setdefault(name, {})[game] = values[0]
-        if same := next((x for x in found if (x.arms, x.differing) == (here, differing)), None):
-            same.games.append(game)
+    found: dict[str, dict[str, dict[str, set[str]]]] = {}
+    configs = [(run, _fields(run.config)) for run in runs]
+    names = sorted({name for _, fields in configs for name in fields}, key=_place)
+    for (run, fields), name in itertools.product(configs, names):
+        by_arm = found.setdefault(name, {}).setdefault(run.game, {})
+        by_arm.setdefault(run.arm, set()).add(fields.get(name, "–"))
+
+    def text(by_game: Mapping[str, set[str]]) -> str:
+        texts = {game: ", ".join(sorted(values)) for game, values in by_game.items()}
+        if len(set(texts.values())) == 1:
+            return next(iter(texts.values()))
+        return "; ".join(f"{game}: {value}" for game, value in texts.items())
+
+    differing, shared = {}, {}
+    for name, games in found.items():
+        if any(by_arm[arm] != by_arm[other] for by_arm in games.values() for arm in by_arm for other in by_arm):
+            differing[name] = {arm: text({g: x[arm] for g, x in games.items() if arm in x}) for arm in arms}
         else:
-            found.append(Settings([game], here, differing))
-    everywhere = [name for name in shared if not any(name in x.differing for x in found)]
-    return found, {name: _by_game(shared[name]) for name in sorted(everywhere, key=_place)}
+            shared[name] = text({game: set.union(*by_arm.values()) for game, by_arm in games.items()})
+    return differing, shared
 
 
 def glossary(
-    runs: Sequence[RunData], differing: Sequence[Settings], arms: Sequence[str], baseline: str | None
+    runs: Sequence[RunData], differing: Mapping[str, Mapping[str, str]], baseline: str | None
 ) -> dict[str, str]:
     """arm -> what it is, in a line: its mode, and in which settings it differs from the baseline."""
     found = {}
-    for arm in arms:
-        mode = MODES[next(run.config.mode for run in runs if run.arm == arm)]
-        with_both = (x for x in differing if {arm, baseline} <= set(x.arms))
-        here = next(with_both, None) or next(x for x in differing if arm in x.arms)
-        place, other = here.arms.index(arm), here.arms.index(baseline) if baseline in here.arms else None
+    for run in runs:
         parts = [
-            f"{name.removeprefix('objectives ').replace(':', '')} {values[place]}"
-            for name, values in here.differing.items()
-            if name != "mode" and values[place] != "–" and (other in (None, place) or values[place] != values[other])
+            f"{name.removeprefix('objectives ').replace(':', '')} {values[run.arm]}"
+            for name, values in differing.items()
+            if name != "mode" and values[run.arm] not in ("–", values.get(baseline) if run.arm != baseline else "–")
         ]
-        found[arm] = "; ".join([mode.help, *parts])
+        found[run.arm] = "; ".join([MODES[run.config.mode].help, *parts])
     return found
 
 
 def _place(name: str) -> tuple:
     return list(INFOS).index(re.split("[ :]", name)[0]), name
-
-
-def _by_game(values: Mapping[str, str]) -> str:
-    if len(set(values.values())) == 1:
-        return next(iter(values.values()))
-    return "; ".join(f"{game}: {value}" for game, value in values.items())
 
 
 def _fields(config: Config) -> dict[str, str]:

@@ -4,7 +4,8 @@ import csv
 import fnmatch
 import functools
 import importlib.resources
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,11 +15,11 @@ from srl_jax import statistics
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
-from srl_jax.statistics import Interval
 
 from .. import diagnostic_plots, plots
 from ..collect import RunData
 from ..colours import Style
+from ..directories import natural
 from . import numbers, pictures
 from .pictures import Curve, Picture
 
@@ -42,7 +43,7 @@ class Shown(NamedTuple):
     Attributes:
         alt: what a reader who does not see it is told.
         title, caption: below it.
-        arms: {arm: how many runs} of its legend, where it has one.
+        arms: of its legend, where it has one: an arm for each of its runs.
         first: whether it is shown at once; others are shown when they are asked for.
     """
 
@@ -50,7 +51,7 @@ class Shown(NamedTuple):
     alt: str
     title: str = ""
     caption: str = ""
-    arms: Mapping[str, int] = {}
+    arms: Sequence[str] = ()
     first: bool = True
 
 
@@ -74,21 +75,25 @@ def beside(path: Path) -> dict[str, Any]:
     return values
 
 
-def figure(path: Path, looks: Looks) -> Shown:
-    """What experiments.figures has drawn, with its title and the question that it asks."""
-    about = beside(path)
-    title, question = (str(about.get(key) or "") for key in ("title", "question"))
-    name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
-    drawn = about.get("styles")
-    if isinstance(drawn, dict) and any(list(looks[arm]) != drawn[arm] for arm in drawn.keys() & looks):
-        question += " Its colours are not this page's: it was drawn of other arms."
-    return Shown(pictures.taken(path, pictures.LARGEST), name, name, question.strip())
+def figures(folders: Iterable[Path], seen: Collection[Path], looks: Looks) -> list[Shown]:
+    """What experiments.figures has drawn, with its title and question; without those that a reader has seen."""
+    shown = []
+    for path in itertools.chain(*(sorted(x.glob("figures/*.png"), key=lambda p: natural(p.name)) for x in folders)):
+        about = beside(path)
+        title, question = (str(about.get(key) or "") for key in ("title", "question"))
+        name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
+        drawn = about.get("styles")
+        if isinstance(drawn, dict) and any(list(looks[arm]) != drawn[arm] for arm in drawn.keys() & looks):
+            question += " Its colours are not this page's: it was drawn of other arms."
+        if path.resolve() not in seen:
+            shown.append(Shown(pictures.taken(path, pictures.LARGEST), name, name, question.strip()))
+    return shown
 
 
 def learning_curves(
     game: str, comparison: numbers.Comparison, looks: Looks, baseline: str | None
-) -> tuple[list[Shown], list[Shown]]:
-    """The means with their intervals, the baseline and a few arms in each; and each arm with all its seeds."""
+) -> dict[str, list[Shown]]:
+    """The "means" with their intervals, the baseline and a few arms in each; "seeds": each arm with all of its."""
     none = np.full(len(comparison.steps), np.nan)
     means, seeds = {}, {}
     for arm, returns in comparison.returns.items():
@@ -106,16 +111,18 @@ def learning_curves(
         lines = [((colour + FAINT, "-"), curve) for curve in curves]
         lines.append(((colour, line), means[arm]._replace(low=none, high=none)))
         apart.append(Shown(pictures.curves(arm, lines, **how), f"{game}: {arm}, each seed"))
-    return together, apart
+    return {"means": together, "seeds": apart}
 
 
-def profiles(found: numbers.Profiles, looks: Looks, baseline: str | None) -> list[Shown]:
+def profiles(comparisons: Mapping[str, numbers.Comparison], looks: Looks, baseline: str | None) -> list[Shown]:
     """Performance profiles; none of a single seed an arm."""
-    if all(np.isnan(interval.low).all() for interval in found.shares.values()):
+    games, thresholds, found = numbers.profiles(comparisons)
+    if all(np.isnan(interval.low).all() for interval in found.values()):
         return []
-    curves = {arm: Curve(found.thresholds, *interval[:3]) for arm, interval in found.shares.items()}
+    curves = {arm: Curve(thresholds, *interval[:3]) for arm, interval in found.items()}
+    counts = {arm: sum(len(comparisons[game].returns[arm]) for game in games) for arm in found}
     how = {"label": "share of runs above it", "across": "normalised return at the end"}
-    return _in_groups(", ".join(found.games), curves, found.runs, looks, baseline, limits=(-0.03, 1.03), **how)
+    return _in_groups(", ".join(games), curves, counts, looks, baseline, limits=(-0.03, 1.03), **how)
 
 
 def _in_groups(
@@ -129,7 +136,7 @@ def _in_groups(
     shown = []
     for group in groups(list(curves), baseline):
         picture = pictures.curves(title, [(looks[arm], curves[arm]) for arm in group], size=SIZE, **how)
-        arms = {arm: counts[arm] for arm in group}
+        arms = [arm for arm in group for _ in range(counts[arm])]
         shown.append(Shown(picture, f"{title}: {how['label']}", arms=arms))
     return shown
 
@@ -143,15 +150,18 @@ def groups(arms: Sequence[str], baseline: str | None) -> list[list[str]]:
     return [first + others[i : i + size] for i in range(0, max(len(others), 1), size)]
 
 
-def differences(
-    game: str, final: Mapping[str, Interval], area: Mapping[str, Interval], looks: Looks, baseline: str | None
-) -> Shown | None:
-    """How arms differ from the baseline, arm -> interval; None where no arm has one."""
-    if all(np.isnan(interval.low) for interval in final.values()):
-        return None
-    panels = {"at the end": final, "averaged over env steps": area}
-    picture = pictures.differences(game, str(baseline), panels, [looks[arm] for arm in final])
-    return Shown(picture, f"{game}: differences from {baseline}")
+def differences(game: str, tables: Sequence[Mapping[str, Any]], looks: Looks, baseline: str) -> list[Shown]:
+    """How arms differ from the baseline at the end and on average, see `numbers.table`; none without intervals."""
+    names = ("at the end", "averaged over env steps")
+    panels = {
+        name: {arm: row["return_difference"] for arm, row in table.items() if "return_difference" in row}
+        for name, table in zip(names, tables, strict=True)
+    }
+    arms = panels[names[0]]
+    if all(np.isnan(interval.low) for interval in arms.values()):
+        return []
+    picture = pictures.differences(game, baseline, panels, [looks[arm] for arm in arms])
+    return [Shown(picture, f"{game}: differences from {baseline}")]
 
 
 def measured(runs: Sequence[RunData], prefixes: Sequence[str], looks: Looks) -> list[Shown]:
@@ -207,19 +217,23 @@ def drift(runs: Iterable[RunData]) -> list[Shown]:
     return shown
 
 
-def own_pictures(runs: Sequence[RunData]) -> list[tuple[RunData, Path]]:
-    """The pictures in the directories of runs that a report cannot draw: games, inputs and outputs."""
-    paths = ((run, path) for run in runs for path in sorted((run.path / "figures").glob("*")))
-    return [(r, p) for r, p in paths if p.suffix in (".gif", ".png") and p.stem not in OWN]
+def own_pictures(games: Iterable[numbers.Game]) -> dict[str, dict[str, list[Shown]]]:
+    """Game -> "gif" and "png" -> what lies with the first seed of each arm, and a report cannot draw.
 
-
-def taken(found: Sequence[tuple[RunData, Path]], suffix: str) -> list[Shown]:
-    """Those of one kind, made smaller where all of them would be too much for a page."""
+    These are games that were played, and inputs and outputs of objectives. They are made smaller where all of
+    them would be too much for a page.
+    """
+    found = [
+        (run, path)
+        for game in games
+        for run in game.first
+        for path in sorted((run.path / "figures").glob("*.*"))
+        if path.suffix in (".gif", ".png") and path.stem not in OWN
+    ]
     limit = min(max(MEDIA_BYTES // max(len(found), 1), SMALLEST_PICTURE), LARGEST_PICTURE)
-    shown = []
+    shown: dict[str, dict[str, list[Shown]]] = {}
     for run, path in found:
-        if path.suffix == suffix:
-            alt = f"{run.game} / {run.arm} / seed {run.seed}: {path.stem}"
-            caption = f"seed {run.seed}: {path.stem}"
-            shown.append(Shown(pictures.taken(path, limit), alt, run.arm, caption))
+        name, kinds = f"seed {run.seed}: {path.stem}", shown.setdefault(run.game, {"gif": [], "png": []})
+        picture = Shown(pictures.taken(path, limit), f"{run.game} / {run.arm} / {name}", run.arm, name)
+        kinds[path.suffix[1:]].append(picture)
     return shown

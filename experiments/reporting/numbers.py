@@ -38,20 +38,43 @@ class Comparison(NamedTuple):
     cut_by: RunData | None
 
 
-class Profiles(NamedTuple):
-    """The share of an arm's runs that end above a normalised return, averaged over games.
+class Game(NamedTuple):
+    """The runs of one game.
 
     Attributes:
-        games: that every arm with a policy has and that have reference scores.
-        runs: arm -> how many.
-        thresholds: [T], from just below the smallest score to the largest.
-        shares: arm -> its profile [T].
+        name: of the game.
+        runs: arm -> its runs, arms in the order of the page.
+        comparable: whether there are runs to compare.
+        comparison: of them; None also where they have no env step in common.
     """
 
-    games: list[str]
-    runs: dict[str, int]
-    thresholds: np.ndarray
-    shares: dict[str, Interval]
+    name: str
+    runs: dict[str, list[RunData]]
+    comparable: bool
+    comparison: Comparison | None
+
+    @property
+    def sound(self) -> list[RunData]:
+        """Those that have not failed: others would cut all curves."""
+        return [run for runs in self.runs.values() for run in runs if not run.failed]
+
+    @property
+    def first(self) -> list[RunData]:
+        """Each arm's first seed of these."""
+        return list({run.arm: run for run in reversed(self.sound)}.values())[::-1]
+
+    @property
+    def played(self) -> list[RunData]:
+        """Those with a policy."""
+        return [run for runs in self.runs.values() for run in runs if has_policy(run)]
+
+    @property
+    def left_out(self) -> list[str]:
+        """A line for each arm of which seeds are not compared."""
+        whys: dict[str, dict[int, str]] = {arm: {} for arm in self.runs}
+        for run, why in collect.left_out([run for runs in self.runs.values() for run in runs]):
+            whys[run.arm][run.seed] = why
+        return [collect.left_out_text(arm, why, len(self.runs[arm])) for arm, why in whys.items() if why]
 
 
 def arms_of(runs: Sequence[RunData]) -> list[str]:
@@ -103,31 +126,24 @@ def finished(run: RunData) -> bool:
     return (evaluated or not has_policy(run)) and reached_step(run) >= config.steps // every * every
 
 
-def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Comparison | None]:
-    """Game -> its `comparable` learning curves at equal steps; None where there is no step that all have.
+def compare(runs: Sequence[RunData]) -> Comparison | None:
+    """The learning curves of one game's runs at equal steps; None where there is no step that all have.
 
     Raises:
         ConfigError: the evaluations of a run are not in ascending order.
     """
-    found: dict[str, Comparison | None] = {}
-    for game, by_arm in collect.grouped(runs).items():
-        members = collect.comparable([run for arm in arms for run in by_arm.get(arm, [])])
-        if not members:
-            continue
-        curves = [collect.steps_and_returns(run) for run in members]
-        for run, (steps, _) in zip(members, curves, strict=True):
-            if (np.diff(steps) <= 0).any():
-                raise ConfigError(f"{run.path}: evaluations in metrics.jsonl are not in ascending order")
-        try:
-            steps, returns = statistics.at_equal_steps(curves)
-        except ValueError:
-            found[game] = None
-            continue
-        ends = [int(curve[0][-1]) for curve in curves]
-        first = members[int(np.argmin(ends))] if min(ends) < max(ends) else None
-        by_arm = {arm: returns[[run.arm == arm for run in members]] for arm in arms}
-        found[game] = Comparison(steps, {arm: x for arm, x in by_arm.items() if len(x)}, first)
-    return found
+    curves = [collect.steps_and_returns(run) for run in runs]
+    for run, (steps, _) in zip(runs, curves, strict=True):
+        if (np.diff(steps) <= 0).any():
+            raise ConfigError(f"{run.path}: evaluations in metrics.jsonl are not in ascending order")
+    try:
+        steps, returns = statistics.at_equal_steps(curves)
+    except ValueError:
+        return None
+    ends = [int(curve[0][-1]) for curve in curves]
+    first = runs[int(np.argmin(ends))] if min(ends) < max(ends) else None
+    arms = dict.fromkeys(run.arm for run in runs)
+    return Comparison(steps, {arm: returns[[run.arm == arm for run in runs]] for arm in arms}, first)
 
 
 def scores(comparisons: Mapping[str, Comparison], of: str) -> dict[str, dict[str, np.ndarray]]:
@@ -179,12 +195,17 @@ def reaching(comparison: Comparison, target: float) -> dict[str, tuple[Interval,
     return found
 
 
-def profiles(comparisons: Mapping[str, Comparison]) -> Profiles:
-    """The performance profiles of all arms; none where no game with reference scores has runs of every arm."""
+def profiles(comparisons: Mapping[str, Comparison]) -> tuple[list[str], np.ndarray, dict[str, Interval]]:
+    """The share of an arm's runs that end above a normalised return, averaged over games.
+
+    Returns:
+        The games that every arm with a policy has and that have reference scores; thresholds [T], from just
+        below the smallest score to the largest; arm -> its profile [T], no arm where there is no such game.
+    """
     given = scores(comparisons, "final")
     games = with_reference_scores(game for game in comparisons if all(game in x for x in given.values()))
     if not games:
-        return Profiles([], {}, np.zeros(0), {})
+        return [], np.zeros(0), {}
     normal = {
         arm: {game: statistics.human_normalised(game, mine[game]) for game in games}
         for arm, mine in given.items()
@@ -195,14 +216,12 @@ def profiles(comparisons: Mapping[str, Comparison]) -> Profiles:
     def profile(drawn: Mapping[str, np.ndarray]) -> np.ndarray:
         return statistics.performance_profile(drawn, thresholds)
 
-    runs = {arm: sum(map(len, mine.values())) for arm, mine in normal.items()}
-    found = {arm: statistics.estimate(profile, mine) for arm, mine in normal.items()}
-    return Profiles(games, runs, thresholds, found)
+    return games, thresholds, {arm: statistics.estimate(profile, mine) for arm, mine in normal.items()}
 
 
-def hours(run: RunData) -> float:
-    """What a run took so far, by its own clock."""
-    return (value_of(run, run.rows[-1], "wall_s") or 0.0) / 3600 if run.rows else 0.0
+def hours(runs: Sequence[RunData]) -> float:
+    """What runs took so far, all together, by their own clocks."""
+    return sum(value_of(run, run.rows[-1], "wall_s") or 0.0 for run in runs if run.rows) / 3600
 
 
 def speed(runs: Sequence[RunData]) -> float | None:

@@ -21,8 +21,21 @@ from ..colours import styles
 from ..directories import natural
 from . import configs, gallery, numbers, readme
 
-TRAINING = ("train/return_mean", "loss/", "grad_norm/", "step_ratio/")
-"""What the keys begin with that the section on training shows."""
+SECTIONS = {
+    "question": "Question and answer",
+    "numbers": "What the numbers say",
+    "curves": "Learning curves",
+    "figures": "Figures",
+    "training": "Training",
+    "diagnostics": "Diagnostics",
+    "playing": "The agents playing",
+    "panels": "Inputs and outputs",
+    "profiles": "Performance profiles",
+    "cost": "Time and cost",
+    "settings": "Settings and protocol",
+    "runs": "Every run",
+}
+"""Their templates, and titles; one that says nothing is left out."""
 
 
 def build(
@@ -59,107 +72,54 @@ def build(
         if not force:
             raise ConfigError(f"{error}; --force compares them all the same") from None
         forced.append(str(error))
-    games = collect.grouped(runs)
-    if unknown := [game for game in reach if game not in games]:
-        raise ConfigError(f"--reach={unknown[0]}: no run of that game; valid: {', '.join(games)}")
+    by_game = collect.grouped(runs)
+    if unknown := [game for game in reach or {} if game not in by_game]:
+        raise ConfigError(f"--reach={unknown[0]}: no run of that game; valid: {', '.join(by_game)}")
     arms = numbers.arms_of(runs)
     baseline = numbers.baseline_of(runs, arms, baseline)
     arms = sorted(arms, key=lambda arm: arm != baseline)  # it first, the others as they were
-    looks = styles(arms)
-    compared = numbers.compare([run for run in runs if not finished_only or numbers.finished(run)], arms)
-    whole = {game: comparison for game, comparison in compared.items() if comparison is not None}
-    tables = {of: numbers.table(whole, of, baseline) for of in ("final", "area")}
-    profiles = numbers.profiles(whole)
+    games = [_game(name, {a: x[a] for a in arms if a in x}, finished_only) for name, x in by_game.items()]
+    comparisons = {game.name: game.comparison for game in games if game.comparison}
     differing, shared = configs.settings(runs, arms)
+    looks = styles(arms)
     readmes = [found for place in places if (found := readme.read(place)) is not None]
-    in_text = {path for found in readmes for path in found.pictures}
-    files = [path for place in places for path in sorted((place / "figures").glob("*.png"), key=_natural)]
     context = {
-        "title": readmes[0].title if len(readmes) == len(places) == 1 else "",
+        "gallery": gallery,
+        "numbers": numbers,
+        "game_record": envs.known,
+        "policies": reference_policies,
+        "published": published,
         "readmes": readmes,
-        "arms": arms,
-        "baseline": baseline,
-        "looks": looks,
-        "glossary": configs.glossary(runs, differing, arms, baseline),
-        "runs": [_run(run, places) for run in runs],
+        "title": readmes[0].title if len(readmes) == len(places) == 1 else "",
         "roots": [_name_of(place) for place in places],
+        "figures": gallery.figures(places, [path for x in readmes for path in x.pictures], looks),
+        "own": gallery.own_pictures(games) if media else {},
+        "runs": [_run(run, places) for run in runs],
         "forced": forced,
         "finished_only": finished_only,
-        "media": media,
         "data": data,
-        "games": [
-            _game(game, members, arms, baseline, looks, compared, tables, reach, media)
-            for game, members in games.items()
-        ],
-        "over_games": {of: table.get(None, {}) for of, table in tables.items()},
-        "over_policies": _policies(profiles.games),
-        "figures": [gallery.figure(path, looks) for path in files if path.resolve() not in in_text],
-        "profiles": gallery.profiles(profiles, looks, baseline),
+        "reach": reach or {},
+        "baseline": baseline,
+        "looks": looks,
+        "glossary": configs.glossary(sorted(runs, key=lambda run: arms.index(run.arm)), differing, baseline),
+        "games": games,
+        "comparisons": comparisons,
+        "final": numbers.table(comparisons, "final", baseline),
+        "area": numbers.table(comparisons, "area", baseline),
+        "over_policies": _policies(numbers.profiles(comparisons)[0]),
         "differing": differing,
         "shared": shared,
     }
-    return _environment().get_template("page.html.j2").render(context), numbers.as_csv(runs)
+    environment = _environment()
+    sections = {name: environment.get_template(f"{name}.html.j2").render(context) for name in SECTIONS}
+    written = {name: Markup(text) for name, text in sections.items() if text.strip()}
+    return environment.get_template("page.html.j2").render(context, sections=written, titles=SECTIONS), numbers.as_csv(runs)
 
 
-def _game(
-    game: str,
-    by_arm: Mapping[str, list[RunData]],
-    arms: Sequence[str],
-    baseline: str | None,
-    looks: gallery.Looks,
-    compared: Mapping[str, numbers.Comparison | None],
-    tables: Mapping[str, Mapping[str | None, dict]],
-    reach: Mapping[str, float],
-    media: bool,
-) -> dict[str, Any]:
-    """What the page says of one game."""
-    members = [run for arm in arms for run in by_arm.get(arm, ())]
-    sound = [run for run in members if not run.failed]  # a failed run would cut all curves
-    first = [run for i, run in enumerate(sound) if run.arm not in {other.arm for other in sound[:i]}]
-    own = gallery.own_pictures(first) if media else []
-    whys: dict[str, dict[int, str]] = {}
-    for run, why in collect.left_out(members):
-        whys.setdefault(run.arm, {})[run.seed] = why
-    playing = [run.config for run in members if has_policy(run)]
-    found = {
-        "name": game,
-        "record": envs.known(game),
-        "left_out": [collect.left_out_text(arm, why, len(by_arm[arm])) for arm, why in whys.items()],
-        "incomparable": game in compared and compared[game] is None,
-        "comparison": compared.get(game),
-        "protocols": list(dict.fromkeys(map(configs.protocol_text, playing))),
-        "seeds": {arm: sum(run.arm == arm for run in sound) for arm in arms if arm in by_arm},
-        "training": gallery.measured(sound, TRAINING, looks),
-        "diagnostics": gallery.measured(sound, ("diag/",), looks),
-        "drift": gallery.drift(first),
-        "playing": gallery.taken(own, ".gif"),
-        "panels": gallery.taken(own, ".png"),
-        "costs": {
-            arm: (len(by_arm[arm]), sum(map(numbers.hours, by_arm[arm])), numbers.speed(by_arm[arm]))
-            for arm in arms
-            if arm in by_arm
-        },
-    }
-    if (comparison := compared.get(game)) is not None:
-        final, area = (tables[of][game] for of in ("final", "area"))
-        told = [{a: x["return_difference"] for a, x in t.items() if "return_difference" in x} for t in (final, area)]
-        target = reach.get(game, float(final[baseline]["return"].point) if baseline in final else None)
-        means, seeds = gallery.learning_curves(game, comparison, looks, baseline)
-        found |= {
-            "end": int(comparison.steps[-1]),
-            "final": final,
-            "area": area,
-            "given": game in reach,
-            "target": target,
-            "reaching": {} if target is None else numbers.reaching(comparison, target),
-            "policies": [(name, row, row.differs_from(playing[0])) for name, row in reference_policies(game).items()],
-            "published": published(game),
-            "config": playing[0],
-            "curves": means,
-            "each_seed": seeds,
-            "differences": gallery.differences(game, *told, looks, baseline) if told[0] else None,
-        }
-    return found
+def _game(name: str, runs: dict[str, list[RunData]], finished_only: bool) -> numbers.Game:
+    every = [run for members in runs.values() for run in members if not finished_only or numbers.finished(run)]
+    comparable = collect.comparable(every)
+    return numbers.Game(name, runs, bool(comparable), numbers.compare(comparable) if comparable else None)
 
 
 def _policies(games: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -196,10 +156,6 @@ def _name_of(root: Path) -> Path:
     return Path(os.path.basename(os.path.abspath(root)))
 
 
-def _natural(path: Path) -> list:
-    return natural(path.name)
-
-
 def _environment() -> Environment:
     found = Environment(
         loader=PackageLoader(__package__),
@@ -210,6 +166,7 @@ def _environment() -> Environment:
     )
     filters = (number, signed, interval, duration, plural, listed, breakable, numbers.verdict)
     found.filters |= {function.__name__: function for function in filters}
+    found.filters["protocol"] = configs.protocol_text
     return found
 
 
