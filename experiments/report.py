@@ -2,8 +2,8 @@
 
 The question and the answer, from the directory's README.md; what the numbers say, with intervals; curves of
 every seed, training, diagnostics, what the agents do and see, cost, and every difference between the arms. It
-opens offline. All rows lie beside it as a table, report.csv. Several directories are compared with each other:
-`python -m experiments.report runs/a runs/b --out=report.html`.
+opens offline. All rows lie beside it as a table, report.csv. Several directories are compared with each
+other: `python -m experiments.report runs/a runs/b --out=report.html`.
 """
 
 import importlib.util

@@ -38,7 +38,9 @@ def about(run: RunData) -> dict[str, str]:
     return {name: texts[name] for name in [*names, "started"] if texts.get(name)}
 
 
-def settings(runs: Sequence[RunData], arms: Sequence[str]) -> tuple[dict[str, dict[str, str]], dict[str, str]]:
+def settings(
+    runs: Sequence[RunData], arms: Sequence[str]
+) -> tuple[dict[str, dict[str, str]], dict[str, str]]:
     """Every field of the configurations, apart from game and seed; specifications by their options.
 
     Returns:
@@ -60,7 +62,9 @@ def settings(runs: Sequence[RunData], arms: Sequence[str]) -> tuple[dict[str, di
 
     differing, shared = {}, {}
     for name, games in found.items():
-        if any(by_arm[arm] != by_arm[other] for by_arm in games.values() for arm in by_arm for other in by_arm):
+        if any(
+            by_arm[arm] != by_arm[other] for by_arm in games.values() for arm in by_arm for other in by_arm
+        ):
             differing[name] = {arm: text({g: x[arm] for g, x in games.items() if arm in x}) for arm in arms}
         else:
             shared[name] = text({game: set.union(*by_arm.values()) for game, by_arm in games.items()})
@@ -76,7 +80,7 @@ def glossary(
         parts = [
             f"{name.removeprefix('objectives ').replace(':', '')} {values[run.arm]}"
             for name, values in differing.items()
-            if name != "mode" and values[run.arm] not in ("–", values.get(baseline) if run.arm != baseline else "–")
+            if name != "mode" and run.arm != baseline and values[run.arm] not in ("–", values.get(baseline))
         ]
         found[run.arm] = "; ".join([MODES[run.config.mode].help, *parts])
     return found

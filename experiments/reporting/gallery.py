@@ -1,9 +1,11 @@
 """The pictures of a report: of what is measured over env steps, and of what the runs' directories hold."""
 
+import base64
 import csv
 import fnmatch
 import functools
 import importlib.resources
+import io
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -14,13 +16,13 @@ import numpy as np
 from srl_jax import statistics
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
+from srl_jax.reading import parse_json
 
 from .. import diagnostic_plots, plots
 from ..collect import RunData
 from ..colours import Style
 from ..directories import natural
-from . import numbers, pictures
+from . import numbers, pictures, readme
 from .pictures import Curve, Picture
 
 MEDIA_BYTES = 600_000
@@ -29,6 +31,10 @@ LARGEST_PICTURE, SMALLEST_PICTURE = 120_000, 8_000
 """Bytes that one of them may have where there are few, and may always have."""
 OWN = ("learning_curve", "losses", "diagnostics", "drift")
 """Pictures of a run that a report draws itself."""
+MANY = pictures.ARMS_A_PICTURE
+"""Arms up to which a picture of all of them can be read."""
+COLUMN = 360
+"""Pixels: the width of a column of the page."""
 SIZE = (4.4, 3.1)
 """Inches of a picture of a whole section: wide enough for many lines, and legible on a phone."""
 FAINT = "50"
@@ -63,11 +69,7 @@ def beside(path: Path) -> dict[str, Any]:
     """
     path = path.with_suffix(".json")
     try:
-        values = parse_json(read_bytes(path, SETTINGS))
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        values = parse_json(readme.text_of(path) or "{}")
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON: {error}") from None
     if not isinstance(values, dict):
@@ -76,9 +78,11 @@ def beside(path: Path) -> dict[str, Any]:
 
 
 def figures(folders: Iterable[Path], seen: Collection[Path], looks: Looks) -> list[Shown]:
-    """What experiments.figures has drawn, with its title and question; without those that a reader has seen."""
+    """What experiments.figures has drawn, with its title and question; not what a README has shown."""
     shown = []
-    for path in itertools.chain(*(sorted(x.glob("figures/*.png"), key=lambda p: natural(p.name)) for x in folders)):
+    for path in itertools.chain(
+        *(sorted(x.glob("figures/*.png"), key=lambda p: natural(p.name)) for x in folders)
+    ):
         about = beside(path)
         title, question = (str(about.get(key) or "") for key in ("title", "question"))
         name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
@@ -93,7 +97,7 @@ def figures(folders: Iterable[Path], seen: Collection[Path], looks: Looks) -> li
 def learning_curves(
     game: str, comparison: numbers.Comparison, looks: Looks, baseline: str | None
 ) -> dict[str, list[Shown]]:
-    """The "means" with their intervals, the baseline and a few arms in each; "seeds": each arm with all of its."""
+    """ "means": all arms, the baseline and a few in each picture; "seeds": each arm with all of its seeds."""
     none = np.full(len(comparison.steps), np.nan)
     means, seeds = {}, {}
     for arm, returns in comparison.returns.items():
@@ -110,11 +114,14 @@ def learning_curves(
         colour, line = looks[arm]
         lines = [((colour + FAINT, "-"), curve) for curve in curves]
         lines.append(((colour, line), means[arm]._replace(low=none, high=none)))
-        apart.append(Shown(pictures.curves(arm, lines, **how), f"{game}: {arm}, each seed"))
+        picture = pictures.curves(arm, lines, size=(3.0, 2.1), **how)
+        apart.append(Shown(picture, f"{game}: {arm}, each seed"))
     return {"means": together, "seeds": apart}
 
 
-def profiles(comparisons: Mapping[str, numbers.Comparison], looks: Looks, baseline: str | None) -> list[Shown]:
+def profiles(
+    comparisons: Mapping[str, numbers.Comparison], looks: Looks, baseline: str | None
+) -> list[Shown]:
     """Performance profiles; none of a single seed an arm."""
     games, thresholds, found = numbers.profiles(comparisons)
     if all(np.isnan(interval.low).all() for interval in found.values()):
@@ -142,16 +149,16 @@ def _in_groups(
 
 
 def groups(arms: Sequence[str], baseline: str | None) -> list[list[str]]:
-    """The arms in groups of at most `pictures.ARMS_A_PICTURE`, about as large as each other, the baseline in each."""
+    """The arms in groups of at most `MANY` and about the same size, the baseline in each."""
     others = [arm for arm in arms if arm != baseline]
     first = [arm for arm in arms if arm == baseline]
-    count = -(-len(others) // (pictures.ARMS_A_PICTURE - len(first))) or 1
+    count = -(-len(others) // (MANY - len(first))) or 1
     size = -(-len(others) // count) or 1
     return [first + others[i : i + size] for i in range(0, max(len(others), 1), size)]
 
 
 def differences(game: str, tables: Sequence[Mapping[str, Any]], looks: Looks, baseline: str) -> list[Shown]:
-    """How arms differ from the baseline at the end and on average, see `numbers.table`; none without intervals."""
+    """How arms differ from the baseline, from the two `numbers.table` of a game; none without intervals."""
     names = ("at the end", "averaged over env steps")
     panels = {
         name: {arm: row["return_difference"] for arm, row in table.items() if "return_difference" in row}
@@ -170,8 +177,10 @@ def measured(runs: Sequence[RunData], prefixes: Sequence[str], looks: Looks) -> 
     Args:
         runs: of one game.
         prefixes: of the keys, "loss/", say. Those that measures.csv does not have come last.
-        looks: arm -> its colour and line.
+        looks: arm -> its colour and line. With more arms than `MANY`, intervals are left out, and so is what
+            matters less.
     """
+    many = len(looks) > MANY
     text = importlib.resources.files(__package__).joinpath("measures.csv").read_text(encoding="utf-8")
     forms = list(csv.DictReader(text.splitlines()))
     keys = sorted({key for run in runs for row in run.rows for key in row if key.startswith(tuple(prefixes))})
@@ -180,7 +189,7 @@ def measured(runs: Sequence[RunData], prefixes: Sequence[str], looks: Looks) -> 
     new = [key for key in keys if key not in known and key != "diag/drift/steps"]
     forms += [{"key": key, "place": 0, "title": key, "meaning": "", "first": ""} for key in new]
     shown = []
-    for form in forms:
+    for form in [form for form in forms if form["first"] or not many]:
         before, _, after = form["key"].partition("*")
         for key in keys:
             if key != form["key"] and (key in exact or not fnmatch.fnmatchcase(key, form["key"])):
@@ -190,6 +199,11 @@ def measured(runs: Sequence[RunData], prefixes: Sequence[str], looks: Looks) -> 
             }
             curves = {arm: pictures.interval_curves(its) for arm, its in members.items()}
             if lines := [(looks[arm], curve) for arm, curve in curves.items() if curve is not None]:
+                if many:  # bands would hide the lines
+                    lines = [
+                        (x, curve._replace(low=np.nan * curve.low, high=np.nan * curve.high))
+                        for x, curve in lines
+                    ]
                 title = form["title"].format(key.removeprefix(before).removesuffix(after))
                 picture = pictures.curves(title, lines, across=plots.steps_label(runs[0].game))
                 alt = f"{runs[0].game}: {title}"
@@ -234,6 +248,20 @@ def own_pictures(games: Iterable[numbers.Game]) -> dict[str, dict[str, list[Show
     shown: dict[str, dict[str, list[Shown]]] = {}
     for run, path in found:
         name, kinds = f"seed {run.seed}: {path.stem}", shown.setdefault(run.game, {"gif": [], "png": []})
-        picture = Shown(pictures.taken(path, limit), f"{run.game} / {run.arm} / {name}", run.arm, name)
-        kinds[path.suffix[1:]].append(picture)
+        picture = _smaller(pictures.taken(path, limit), limit)
+        kinds[path.suffix[1:]].append(Shown(picture, f"{run.game} / {run.arm} / {name}", run.arm, name))
     return shown
+
+
+def _smaller(picture: Picture, limit: int) -> Picture:
+    """A WebP as wide as a column of the page, in place of a JPEG that has more bytes than the limit."""
+    if picture.bytes <= limit or "jpeg" not in picture.source[:20]:
+        return picture
+    from PIL import Image
+
+    file = io.BytesIO()
+    with Image.open(io.BytesIO(base64.b64decode(picture.source.partition(",")[2]))) as image:
+        image.thumbnail((COLUMN, image.height))
+        image.save(file, format="WEBP", quality=50)
+        source = f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
+        return Picture(source, image.size, len(file.getvalue()))

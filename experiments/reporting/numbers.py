@@ -185,7 +185,10 @@ def verdict(difference: Interval) -> str:
 
 
 def reaching(comparison: Comparison, target: float) -> dict[str, tuple[Interval, int]]:
-    """arm -> env steps until a score is reached, the median over seeds (`NEVER` or more: never); seeds that did."""
+    """arm -> env steps until a score is reached, the median over seeds, and how many seeds reached it.
+
+    NEVER or more is never.
+    """
     found = {}
     for arm, curves in comparison.returns.items():
         taken = statistics.steps_to(comparison.steps, curves, target)
@@ -244,18 +247,21 @@ def value_of(run: RunData, row: Mapping[str, Any], key: str) -> float | None:
 
 
 def as_csv(runs: Sequence[RunData]) -> str:
-    """Every row of all runs: game, arm, seed, kind ("train" or "eval"), env_step, and a column for each number.
+    """Every row of all runs: game, arm, seed, kind ("train" or "eval"), env_step, and a column a number.
 
     Lists (the returns of single games, drift) are left out. What a row does not have is empty.
     """
-    rows = [(run, row) for run in runs for row in run.rows]
-    keys = {key for _, row in rows for key, value in row.items() if isinstance(value, int | float)}
-    keys = sorted(keys - {"env_steps"})
+    rows = []
+    for run in runs:
+        for row in run.rows:
+            values = {key: value for key, value in row.items() if isinstance(value, int | float)}
+            own = {"game": run.game, "arm": run.arm, "seed": run.seed, "kind": row["kind"]}
+            rows.append({**own, "env_step": values.pop("env_steps"), **values})
+    first = ["game", "arm", "seed", "kind", "env_step"]
     file = io.StringIO()
-    writer = csv.writer(file, lineterminator="\n")
-    writer.writerow(["game", "arm", "seed", "kind", "env_step", *keys])
-    for run, row in rows:
-        values = (row.get(key) for key in keys)
-        values = ("" if x is None or isinstance(x, list) else x for x in values)
-        writer.writerow([run.game, run.arm, run.seed, row["kind"], row["env_steps"], *values])
+    writer = csv.DictWriter(
+        file, [*first, *sorted({x for row in rows for x in row} - {*first})], lineterminator="\n"
+    )
+    writer.writeheader()
+    writer.writerows(rows)
     return file.getvalue()

@@ -16,9 +16,8 @@ from srl_jax.errors import ConfigError
 from srl_jax.statistics import Interval
 
 from .. import collect
-from ..collect import RunData, has_policy
+from ..collect import RunData
 from ..colours import styles
-from ..directories import natural
 from . import configs, gallery, numbers, readme
 
 SECTIONS = {
@@ -73,7 +72,7 @@ def build(
             raise ConfigError(f"{error}; --force compares them all the same") from None
         forced.append(str(error))
     by_game = collect.grouped(runs)
-    if unknown := [game for game in reach or {} if game not in by_game]:
+    if unknown := [game for game in reach if game not in by_game]:
         raise ConfigError(f"--reach={unknown[0]}: no run of that game; valid: {', '.join(by_game)}")
     arms = numbers.arms_of(runs)
     baseline = numbers.baseline_of(runs, arms, baseline)
@@ -98,7 +97,7 @@ def build(
         "forced": forced,
         "finished_only": finished_only,
         "data": data,
-        "reach": reach or {},
+        "reach": reach,
         "baseline": baseline,
         "looks": looks,
         "glossary": configs.glossary(sorted(runs, key=lambda run: arms.index(run.arm)), differing, baseline),
@@ -113,11 +112,14 @@ def build(
     environment = _environment()
     sections = {name: environment.get_template(f"{name}.html.j2").render(context) for name in SECTIONS}
     written = {name: Markup(text) for name, text in sections.items() if text.strip()}
-    return environment.get_template("page.html.j2").render(context, sections=written, titles=SECTIONS), numbers.as_csv(runs)
+    html = environment.get_template("page.html.j2").render(context, sections=written, titles=SECTIONS)
+    return html, numbers.as_csv(runs)
 
 
 def _game(name: str, runs: dict[str, list[RunData]], finished_only: bool) -> numbers.Game:
-    every = [run for members in runs.values() for run in members if not finished_only or numbers.finished(run)]
+    every = [
+        run for members in runs.values() for run in members if not finished_only or numbers.finished(run)
+    ]
     comparable = collect.comparable(every)
     return numbers.Game(name, runs, bool(comparable), numbers.compare(comparable) if comparable else None)
 
@@ -128,7 +130,9 @@ def _policies(games: Sequence[str]) -> dict[str, dict[str, float]]:
     for name in POLICIES:
         rows = {game: reference_policies(game).get(name) for game in games}
         if rows and all(rows.values()):
-            normal = {game: statistics.human_normalised(game, [row.return_mean]) for game, row in rows.items()}
+            normal = {
+                game: statistics.human_normalised(game, [row.return_mean]) for game, row in rows.items()
+            }
             found[name] = {of: float(statistic(normal)) for of, statistic in statistics.AGGREGATES.items()}
     return found
 

@@ -27,21 +27,30 @@ class Readme(NamedTuple):
     pictures: list[Path]
 
 
-def read(folder: Path) -> Readme | None:
-    """The README.md of a directory of runs, or None where there is none.
+def text_of(path: Path) -> str | None:
+    """What a file says, in UTF-8; None where there is none.
 
     Raises:
         ConfigError: it cannot be read.
     """
-    path = folder / "README.md"
     try:
-        text = read_bytes(path, SETTINGS).decode("utf-8")
+        return read_bytes(path, SETTINGS).decode("utf-8")
     except FileNotFoundError:
         return None
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     except ValueError as error:
         raise ConfigError(f"{path}: {error}") from None
+
+
+def read(folder: Path) -> Readme | None:
+    """The README.md of a directory of runs, or None where there is none.
+
+    Raises:
+        ConfigError: it cannot be read.
+    """
+    if (text := text_of(folder / "README.md")) is None:
+        return None
     markdown = MarkdownIt("js-default", {"html": False})
     markdown.add_render_rule("table_open", lambda *_: '<div class="scroll" tabindex="0"><table>')
     markdown.add_render_rule("table_close", lambda *_: "</table></div>")
@@ -58,7 +67,7 @@ def read(folder: Path) -> Readme | None:
 
 
 def _safe(token: Token, folder: Path, shown: list[Path]) -> Token:
-    """The token as it may stand in a page that is read elsewhere; pictures of the folder become part of it."""
+    """The token as it may stand in a page that is read elsewhere; its picture becomes part of the page."""
     if token.type == "image":
         path = (folder / str(token.attrs["src"])).resolve()
         inside = path.is_relative_to(folder.resolve()) and path.suffix in (".png", ".gif")
