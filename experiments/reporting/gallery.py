@@ -204,7 +204,7 @@ def measured(runs: Sequence[RunData], prefixes: Sequence[str], looks: Looks) -> 
                         (x, curve._replace(low=np.nan * curve.low, high=np.nan * curve.high))
                         for x, curve in lines
                     ]
-                title = form["title"].format(key.removeprefix(before).removesuffix(after))
+                title = form["title"].replace("{}", key.removeprefix(before).removesuffix(after))
                 picture = pictures.curves(title, lines, across=plots.steps_label(runs[0].game))
                 alt = f"{runs[0].game}: {title}"
                 shown.append(Shown(picture, alt, caption=form["meaning"], first=bool(form["first"])))
