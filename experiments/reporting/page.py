@@ -77,7 +77,13 @@ def build(
     arms = numbers.arms_of(runs)
     baseline = numbers.baseline_of(runs, arms, baseline)
     arms = sorted(arms, key=lambda arm: arm != baseline)  # it first, the others as they were
-    games = [_game(name, {a: x[a] for a in arms if a in x}, finished_only) for name, x in by_game.items()]
+    games = []
+    for name, members in by_game.items():
+        ordered = {arm: members[arm] for arm in arms if arm in members}
+        taken = [x for those in ordered.values() for x in those if not finished_only or numbers.finished(x)]
+        comparable = collect.comparable(taken)
+        comparison = numbers.compare(comparable) if comparable else None
+        games.append(numbers.Game(name, ordered, bool(comparable), comparison))
     comparisons = {game.name: game.comparison for game in games if game.comparison}
     differing, shared = configs.settings(runs, arms)
     looks = styles(arms)
@@ -114,14 +120,6 @@ def build(
     written = {name: Markup(text) for name, text in sections.items() if text.strip()}
     html = environment.get_template("page.html.j2").render(context, sections=written, titles=SECTIONS)
     return html, numbers.as_csv(runs)
-
-
-def _game(name: str, runs: dict[str, list[RunData]], finished_only: bool) -> numbers.Game:
-    every = [
-        run for members in runs.values() for run in members if not finished_only or numbers.finished(run)
-    ]
-    comparable = collect.comparable(every)
-    return numbers.Game(name, runs, bool(comparable), numbers.compare(comparable) if comparable else None)
 
 
 def _policies(games: Sequence[str]) -> dict[str, dict[str, float]]:
