@@ -6,6 +6,7 @@ opens offline. All rows lie beside it as a table, report.csv. Several directorie
 other: `python -m experiments.report runs/a runs/b --out=report.html`.
 """
 
+import functools
 import importlib.util
 import math
 import os
@@ -25,28 +26,20 @@ NEEDED = {"jinja2": "Jinja2", "markdown_it": "markdown-it-py", "matplotlib": "ma
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_multi_string(
-        "runs",
-        None,
-        "directory in or below which the runs are, or several; the name may be left out",
-        flag_values=values,
-    )
-    flags.DEFINE_string(
-        "out", None, "file to write, must end in .html; beside it goes a .csv", flag_values=values
-    )
-    flags.DEFINE_boolean("overwrite", False, "replace the files if they are there", flag_values=values)
-    flags.DEFINE_string(
-        "baseline", None, "arm that the others are compared with; by default RL alone", flag_values=values
-    )
-    flags.DEFINE_multi_string(
+    kinds = (flags.DEFINE_string, flags.DEFINE_boolean, flags.DEFINE_multi_string)
+    text, yes, texts = (functools.partial(kind, flag_values=values) for kind in kinds)
+    texts("runs", None, "directory in or below which the runs are, or several; the name may be left out")
+    text("out", None, "file to write, must end in .html; beside it goes a .csv")
+    yes("overwrite", False, "replace the files if they are there")
+    text("baseline", None, "arm that the others are compared with; by default RL alone")
+    texts(
         "reach",
         [],
         "GAME=SCORE, the score whose env steps are asked for; by default what the baseline ends with",
-        flag_values=values,
     )
-    flags.DEFINE_boolean("force", False, "compare runs with different protocols", flag_values=values)
-    flags.DEFINE_boolean("finished_only", False, "compare only runs that have ended", flag_values=values)
-    flags.DEFINE_boolean("media", True, "show the runs' own pictures", flag_values=values)
+    yes("force", False, "compare runs with different protocols")
+    yes("finished_only", False, "compare only runs that have ended")
+    yes("media", True, "show the runs' own pictures")
 
 
 def check_out(out: str | None, *, overwrite: bool) -> Path:
