@@ -1,5 +1,6 @@
 """experiments.report: what is on the page, its numbers by hand, and what it refuses."""
 
+import base64
 import csv
 import dataclasses
 import io
@@ -15,16 +16,15 @@ from absl import flags
 from experiments import collect, plots, report
 from experiments import flags as config_flags
 from experiments.collect import RunData
-from experiments.reporting import configs, numbers
 from srl_jax import ending
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from tests.helpers import NOT_FINITE
 
-pytestmark = pytest.mark.skipif(
-    not all(map(report.importlib.util.find_spec, report.NEEDED)), reason="needs the extra plots"
-)
+Image = pytest.importorskip("PIL.Image", reason="needs the extra plots")
+pages = pytest.importorskip("experiments.reporting.page", reason="needs the extra plots")
+configs, gallery, numbers, pictures = pages.configs, pages.gallery, pages.numbers, pages.gallery.pictures
 
 ODD = '<b>&"odd"'
 """Of an arm whose name is HTML."""
@@ -114,9 +114,7 @@ class Page(HTMLParser):
 
 
 def build(*runs, **options):
-    from experiments.reporting import page
-
-    return page.build(*runs, **options)[0]
+    return pages.build(*runs, **options)[0]
 
 
 @pytest.fixture(scope="module")
@@ -257,6 +255,8 @@ def test_training_and_diagnostics_are_drawn_and_every_seed(page):
 
 
 def test_cost_settings_and_protocol(page):
+    labels = [plots.steps_label(game) for game in ("Pong", "CatchDistractor", "")]
+    assert labels == ["env steps (4 frames each)", "env steps", "env steps"]
     cost = page.table("Time and cost of each arm")
     assert cost["Catch / rl"] == ["2", "4.0 h", "2.0 h", "100", "1.00 times"]
     assert cost["Catch / joint"][-2:] == ["50", "2.00 times"]
@@ -395,8 +395,6 @@ def test_other_protocols_are_refused_or_said(tmp_path):
     ],
 )
 def test_what_is_not_what_training_writes_is_named(runs, tmp_path, monkeypatch, file, content, message):
-    from experiments.reporting import gallery
-
     monkeypatch.setattr(gallery, "learning_curves", lambda *_: {"means": [], "seeds": []})
     monkeypatch.setattr(gallery, "measured", lambda *_: [])
     shutil.copytree(runs, tmp_path / "runs")
@@ -434,12 +432,45 @@ def test_a_performance_profile_by_hand():
     assert np.isnan(joint.low).all() and (rl.low[between] == 0).all() and (rl.high[between] == 1).all()
 
 
+@pytest.mark.parametrize("noise", [False, True])
+def test_large_pictures_are_made_smaller(tmp_path, noise):
+    rng = np.random.default_rng(0)
+    shape = (40, 42, 42, 1)
+    frames = rng.integers(0, 256, shape, dtype=np.uint8) if noise else np.zeros(shape, np.uint8)
+    path = plots.gif(frames, tmp_path / "play.gif", scale=2)
+    limit = 25_000 if noise else path.stat().st_size
+    found = pictures.taken(path, limit)
+    with opened(found) as image:
+        assert found.bytes <= limit and image.size == ((42, 42) if noise else (84, 84))
+        # Every second frame, for twice as long each, and the first ones of these.
+        if noise:
+            assert image.info["duration"] == 140 and 5 < image.n_frames < 20
+            np.testing.assert_array_equal(np.asarray(image.convert("L")), frames[0, ..., 0])
+    assert pictures.taken(tmp_path / "none.gif", limit) is None
+
+
+def test_many_pictures_are_made_smaller_still(tmp_path, monkeypatch):
+    image = np.random.default_rng(0).random((6, 42, 42, 1), np.float32)
+    run = collect.load_run(write_run(tmp_path / "rl/seed0", [0.0]))
+    plots.image_panel(image, image, image[::-1], run.path / "figures/reconstruction.png", "")
+    plots.losses(run.rows, run.path / "figures/losses.png")  # which a report draws itself
+    monkeypatch.setattr(gallery, "LARGEST_PICTURE", 20_000)
+    games = [numbers.Game("Catch", {"rl": [run]}, True, None)]
+    (shown,) = gallery.own_pictures(games)["Catch"]["png"]
+    with opened(shown.picture) as image:
+        assert image.format == "WEBP" and image.width == gallery.COLUMN
+    larger = pictures.taken(run.path / "figures/reconstruction.png", 20_000)
+    assert shown.picture.bytes < larger.bytes / 1.5 and shown.picture.size == image.size
+
+
+def opened(picture):
+    return Image.open(io.BytesIO(base64.b64decode(picture.source.partition(",")[2])))
+
+
 @pytest.mark.parametrize(("arms", "sizes"), [(0, [0]), (1, [1]), (6, [6]), (7, [4, 4]), (14, [6, 6, 4])])
 def test_arms_are_drawn_in_groups_with_the_baseline(arms, sizes):
-    from experiments.reporting.gallery import groups
-
     names = [f"arm{i}" for i in range(arms)]
-    found = groups(names, "arm3")
+    found = gallery.groups(names, "arm3")
     assert [len(group) for group in found] == sizes and set(sum(found, [])) == set(names)
     assert arms < 4 or all("arm3" in group for group in found)
 
