@@ -87,7 +87,7 @@ def figures(folders: Iterable[Path], seen: Collection[Path], looks: Looks) -> li
         title, question = (str(about.get(key) or "") for key in ("title", "question"))
         name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
         drawn = about.get("styles")
-        if isinstance(drawn, dict) and any(list(looks[arm]) != drawn[arm] for arm in drawn.keys() & looks):
+        if isinstance(drawn, dict) and any(looks[arm][0] not in str(drawn[arm]) for arm in drawn.keys() & looks):
             question += " Its colours are not this page's: it was drawn of other arms."
         if path.resolve() not in seen:
             shown.append(Shown(pictures.taken(path, pictures.LARGEST), name, name, question.strip()))
@@ -262,6 +262,6 @@ def _smaller(picture: Picture, limit: int) -> Picture:
     file = io.BytesIO()
     with Image.open(io.BytesIO(base64.b64decode(picture.source.partition(",")[2]))) as image:
         image.thumbnail((COLUMN, image.height))
-        image.save(file, format="WEBP", quality=50)
+        image.save(file, format="WEBP", quality=40, method=6)
         source = f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
         return Picture(source, image.size, len(file.getvalue()))
