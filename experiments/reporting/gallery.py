@@ -86,8 +86,8 @@ def figures(folders: Iterable[Path], seen: Collection[Path], looks: Looks) -> li
         about = beside(path)
         title, question = (str(about.get(key) or "") for key in ("title", "question"))
         name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
-        drawn = about.get("styles")
-        if isinstance(drawn, dict) and any(looks[arm][0] not in str(drawn[arm]) for arm in drawn.keys() & looks):
+        drawn = about["styles"] if isinstance(about.get("styles"), dict) else {}
+        if any(looks[arm][0] not in str(drawn[arm]) for arm in drawn.keys() & looks):
             question += " Its colours are not this page's: it was drawn of other arms."
         if path.resolve() not in seen:
             shown.append(Shown(pictures.taken(path, pictures.LARGEST), name, name, question.strip()))
