@@ -10,8 +10,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from .arms import FIGURES
-from .plots import COLOURS
 
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
+"""Okabe and Ito's palette: distinguishable to colour-blind readers."""
 LINES = ("-", "--", ":")
 """Of arms that have the same colour."""
 Style = tuple[str, str]

@@ -13,7 +13,7 @@ from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
-from .. import collect, diagnostic_plots, plots
+from .. import collect, plots, run_figures
 from ..collect import RunData
 from ..directories import natural
 from . import diagnostics, numbers, pictures
@@ -238,7 +238,7 @@ def _drift(report: Report, game: str) -> Content:
     """The error of each epoch's decoder on each epoch's encoder, of each arm's first seed."""
     found = []
     for run in _first_runs(report, game):
-        picture = pictures.drawn(functools.partial(diagnostic_plots.drift_matrix, run.rows, title=""))
+        picture = pictures.drawn(functools.partial(run_figures.drift_matrix, run.rows, title=""))
         if picture is not None:
             caption = [
                 tag("strong", breakable(run.arm)),

@@ -1,0 +1,124 @@
+"""Pictures of frames: what objectives make of observations, games as GIFs, and smaller files of both.
+
+Pillow and matplotlib are imported where they are used, see `plots.available`.
+"""
+
+import io
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from . import plots
+
+MAX_EXAMPLES = 6
+CHANNELS = (1, 3)  # of an image that can be shown: grey, or red, green and blue
+
+
+def image_panel(
+    inputs: np.ndarray,
+    targets: np.ndarray,
+    outputs: np.ndarray,
+    path: str | os.PathLike,
+    title: str,
+) -> Path:
+    """Draws examples in rows: input, target, output, and how far the output is from the target.
+
+    Three channels are shown in colour; the difference is then the largest of the three.
+
+    Args:
+        inputs: float [B, H, W, C] in [0, 1], C of 1 or 3; the newest frame that the encoder saw. The first 6
+            examples are drawn.
+        targets: likewise; what the output should be.
+        outputs: likewise; may leave [0, 1], which is shown clipped; the difference is not clipped.
+        path: of the PNG file.
+        title: of the figure.
+
+    Raises:
+        ValueError: if the shapes differ or the images are not float.
+    """
+    given = [np.asarray(images) for images in (inputs, targets, outputs)]
+    alike = len({images.shape for images in given}) == 1
+    if not alike or given[0].ndim != 4 or given[0].shape[3] not in CHANNELS or not given[0].size:
+        shapes = ", ".join(str(images.shape) for images in given)
+        raise ValueError(f"images must be [B, H, W, 1] or [B, H, W, 3], all of one shape; got {shapes}")
+    if not all(np.issubdtype(images.dtype, np.floating) for images in given):
+        raise ValueError("images must be float in [0, 1]")
+    shown = [images[:MAX_EXAMPLES].astype(np.float32) for images in given]
+    difference = np.abs(shown[2] - shown[1]).max(-1, keepdims=True)
+    top = float(difference.max()) or 1.0
+    forms = [("input", "gray", 1.0), ("target", "gray", 1.0), ("output", "gray", 1.0)]
+    forms.append(("|output - target|", "inferno", top))
+
+    count = len(difference)
+    figure = plots.new_figure(1.15 * 4 + 0.9, 1.15 * count + 0.75)
+    axes = figure.subplots(count, 4, squeeze=False)
+    for column, ((name, colours, most), images) in enumerate(zip(forms, [*shown, difference], strict=True)):
+        for cell, image in zip(axes[:, column], images, strict=True):
+            pixels = image[..., 0] if image.shape[-1] == 1 else image.clip(0, 1)
+            drawn = cell.imshow(pixels, cmap=colours, vmin=0, vmax=most)
+            cell.set_axis_off()
+        axes[0, column].set_title(name, fontsize=9)
+    bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02, aspect=12 * count)
+    bar.set_label("absolute difference", fontsize=8)
+    bar.ax.tick_params(labelsize=7)
+    figure.suptitle(title, fontsize=10).set_parse_math(False)
+    return plots.save(figure, path)
+
+
+def gif(frames: np.ndarray, file: Any, fps: float = 15, scale: int = 3) -> Any:
+    """Writes frames as a GIF that repeats for ever.
+
+    Args:
+        frames: uint8 [T, H, W, C], C of 1 (grey) or 3 (RGB), T at least 1.
+        file: a path, whose directory is made where there is none, or a binary file.
+        fps: frames a second; a GIF counts in hundredths of a second, and is rounded to them.
+        scale: every pixel becomes a square of this many pixels a side.
+
+    Returns:
+        The path, or the file.
+
+    Raises:
+        ValueError: for another shape or dtype.
+    """
+    from PIL import Image
+
+    frames = np.asarray(frames)
+    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] not in CHANNELS or not len(frames):
+        got = f"{frames.dtype} {frames.shape}"
+        raise ValueError(f"frames must be uint8 [T, H, W, 1] or [T, H, W, 3], T at least 1; got {got}")
+    frames = frames.repeat(scale, axis=1).repeat(scale, axis=2)
+    first, *others = [Image.fromarray(frame[..., 0] if frame.shape[-1] == 1 else frame) for frame in frames]
+    if isinstance(file, str | os.PathLike):
+        Path(file).parent.mkdir(parents=True, exist_ok=True)
+    duration = 10 * max(round(100 / fps), 2)  # milliseconds; browsers slow down a GIF with shorter frames
+    first.save(file, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    return file
+
+
+def smaller_gif(image: Any, limit: int) -> bytes:
+    """A GIF in fewer bytes: without what scaling up has added, then with every second frame, which plays as
+    fast, then without the last ones.
+
+    Args:
+        image: of Pillow.
+        limit: of bytes, which is kept to down to a single frame.
+    """
+    from PIL import ImageSequence
+
+    frames = np.stack([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)])
+    if (frames == frames[..., :1]).all():
+        frames = frames[..., :1]
+    while np.array_equal((half := frames[:, ::2, ::2]).repeat(2, axis=1).repeat(2, axis=2), frames):
+        frames = half
+    fps = 1000 / (image.info.get("duration") or 70)
+
+    def data() -> bytes:
+        return gif(frames, io.BytesIO(), fps, scale=1).getvalue()
+
+    if len(data()) > limit and len(frames) > 1:
+        frames, fps = frames[::2], fps / 2
+    while (size := len(data())) > limit and len(frames) > 1:
+        frames = frames[: max(1, min(len(frames) - 1, len(frames) * limit // size))]
+    return data()
