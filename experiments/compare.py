@@ -7,7 +7,7 @@ without --out, it is all that is made.
 """
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,9 +34,9 @@ class Arm(NamedTuple):
 
     Attributes:
         game: what is played.
-        name: of its directory.
-        place: of that, with the argument.
-        config: of its first seed.
+        name: of the arm.
+        place: the directory of its first seed.
+        config: of that.
         curves: env steps [N] and values [N] of each seed, at least one.
         label: says in what it differs from the others.
     """
@@ -49,7 +49,7 @@ class Arm(NamedTuple):
     label: str = ""
 
 
-def read(roots: Sequence[str], key: str, *, force: bool = False) -> tuple[list[Arm], list[str]]:
+def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[Arm], list[str]]:
     """The arms below directories, and lines that say which runs are left out, or are of another protocol.
 
     Args:
@@ -60,14 +60,14 @@ def read(roots: Sequence[str], key: str, *, force: bool = False) -> tuple[list[A
     Raises:
         ConfigError: there is one curve, no run has the key, or runs cannot be compared.
     """
-    found: list[tuple[str, list[RunData]]] = []
+    found: list[list[RunData]] = []
     for root in roots:
-        runs = collect.load_runs(os.path.expanduser(root))
+        runs = collect.load_runs(root)
         collect.check_arms(runs)
-        found += [(root, members) for arms in collect.grouped(runs).values() for members in arms.values()]
+        found += [members for arms in collect.grouped(runs).values() for members in arms.values()]
     if len(found) < 2:
         raise ConfigError(f"--runs={roots[0]}: one curve; name a second run, or a folder of several")
-    runs = [run for _, members in found for run in members]
+    runs = [run for members in found for run in members]
     known = {name for run in runs for row in run.rows for name in row} - {*LEADING[:2]}
     if key not in known:
         near = specs.near(key, known) or sorted(known)
@@ -79,12 +79,12 @@ def read(roots: Sequence[str], key: str, *, force: bool = False) -> tuple[list[A
     notes = collect.check_protocols(runs, force=force) if key.startswith("eval/") else []
     whys = {run.path: why for run, why in collect.left_out(runs, key)}
     arms = []
-    for root, members in found:
-        game, name, config = members[0].game, members[0].arm, members[0].config
+    for members in found:
+        path, game, name, _, config, *_ = members[0]
         if out := {run.seed: whys[run.path] for run in members if run.path in whys}:
             notes.append(f"{game}, {collect.left_out_text(name, out, len(members))}")
         if curves := [collect.steps_and_values(run, key) for run in members if run.path not in whys]:
-            arms.append(Arm(game, name, os.path.join(root, name), config, curves))
+            arms.append(Arm(game, name, str(path), config, curves))
     if not arms:
         raise ConfigError(f"--runs: nothing to draw; {'; '.join(notes)}")
     return [arm._replace(label=label) for arm, label in zip(arms, _labels(arms), strict=True)], notes
@@ -169,10 +169,15 @@ def _interval(interval: statistics.Interval) -> str:
     return f"{interval.point:.4g}{limits}"
 
 
-def draw(arms: Sequence[Arm], key: str, notes: Sequence[str], path: Path) -> None:
-    """Draws the curves, a panel a game; an arm has the colour of its name, where that is its own."""
+def draw(arms: Sequence[Arm], key: str, notes: Sequence[str], path: Path, among: Iterable[str] = ()) -> None:
+    """Draws the curves, a panel a game.
+
+    An arm whose name is its own has the colour that it has in all figures of a directory; `among` is all arms
+    there.
+    """
     names = {arm.label: arm.name for arm in arms}
-    looks = styles(list(names.values() if len({*names.values()}) == len(names) else names)).values()
+    own = len({*names.values()}) == len(names)
+    looks = styles(list(names.values() if own else names), among if own else ()).values()
     panels = []
     for game in dict.fromkeys(arm.game for arm in arms):
         members = [arm for arm in arms if arm.game == game]
@@ -181,7 +186,7 @@ def draw(arms: Sequence[Arm], key: str, notes: Sequence[str], path: Path) -> Non
         panels.append(plots.Panel(game, lines, (), policies))
     bands = ["bands: 95 % t intervals over seeds"] if any(len(arm.curves) > 1 for arm in arms) else []
     note = "\n".join([*bands, *notes])
-    plots.draw_panels(panels, path, key, note, dict(zip(names, looks, strict=True)), key)
+    plots.draw_panels(panels, path, "", note, dict(zip(names, looks, strict=True)), key)
 
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
@@ -206,17 +211,19 @@ def compare(values: flags.FlagValues) -> None:
     """
     if not values["runs"].value:
         raise ConfigError("--runs: missing; name two, srl-jax compare runs/a runs/b")
+    roots = [Path(os.path.expanduser(root)) for root in values["runs"].value]
     key, out = values["key"].value, values["out"].value
     path = config_flags.check_file("out", out, ".png", overwrite=values["overwrite"].value) if out else None
     if path and not plots.available():
         raise ConfigError("--out: needs matplotlib and Pillow: pip install 'srl-jax[plots]'")
-    arms, notes = read(values["runs"].value, key, force=values["force"].value)
+    arms, notes = read(roots, key, force=values["force"].value)
     text = table(arms, key)
     for note in notes:
         display.say(note)
     if path:
         try:
-            draw(arms, key, notes, path)
+            among = {name for root in roots for name in collect.arm_names(root)}
+            draw(arms, key, notes, path, among)
         except OSError as error:
             raise SaveError(f"--out={out}: {error.strerror}") from error
     display.result(text)

@@ -126,7 +126,7 @@ def draw_panels(
     Args:
         panels: at least one, with at least one line.
         path: of the PNG file.
-        title: of the figure.
+        title: of the figure, or empty.
         note: below it; lines.
         looks: label -> colour and line; None for those that the labels have by themselves.
         label: of the vertical axes.
@@ -147,7 +147,8 @@ def draw_panels(
         handles |= _draw_panel(axes, panel, looks, seeds)
     if not size:
         _below(figure, int(17 * width * columns), handles, panels, note)
-        figure.suptitle(title, fontsize=11).set_parse_math(False)
+        if title:
+            figure.suptitle(title, fontsize=11).set_parse_math(False)
     return save(figure, path)
 
 
@@ -188,7 +189,7 @@ def _draw_panel(
     )
     if panel.log and len(shown) and 0 < 5 * np.nanmin(shown) <= np.nanmax(shown):
         _log_axis(axes, np.nanmax(shown) / np.nanmin(shown))
-    elif len(shown):
+    elif np.isfinite(shown).any():
         axes.set_ylim(*(panel.limits or heights([line.curve for line in lines], shown)))
     levels(axes, {x.method: x.score for x in panel.policies}, panel.levels)
     return handles

@@ -20,6 +20,8 @@ GIF_SIZE = 84
 """Pixels: the longer side of play.gif, where frames are smaller by a whole factor."""
 MOST_LINES = 9
 """Of a panel of diagnostics; one with more draws their mean alone, if there is one."""
+LOGARITHMIC = ("loss/", "norm", "error/")
+"""What is in a key whose axis may be logarithmic."""
 
 
 def draw_run(
@@ -82,13 +84,11 @@ def learning_curve(
     Raises:
         ConfigError: the thesis has no such curve.
     """
-    reference = None
-    if thesis:
-        figure, _, arm = thesis.partition("/")
-        try:
-            reference = thesis_curve(figure, config.game, arm)
-        except ValueError as error:
-            raise ConfigError(f"--thesis={thesis}: {error}") from None
+    figure, _, arm = thesis.partition("/")
+    try:
+        reference = thesis_curve(figure, config.game, arm) if thesis else None
+    except ValueError as error:
+        raise ConfigError(f"--thesis={thesis}: {error}") from None
     evals = [row for row in rows if row["kind"] == "eval" and "eval/return_mean" in row]
     if not evals:
         return None
@@ -97,13 +97,16 @@ def learning_curve(
     low, high = np.array([(game.min(), game.max()) for game in games]).T
     curve = plots.Curve([row["env_steps"] for row in evals], means, low, high)
     counts = sorted({len(game) for game in games if np.isfinite(game).all()})
-    note = f"band: worst to best of {' or '.join(map(str, counts))} games" if counts else ""
+    notes = [f"band: worst to best of {' or '.join(map(str, counts))} games"] if counts else []
+    notes += [f"dashed: the thesis, figure {figure}, {arm} (one run)"] if thesis else []
     line = plots.Line("this run", curve, thesis=reference)
     panel = plots.Panel(config.game, [line], (), plots.policy_levels(config))
-    return plots.draw_panels([panel], path, title, note)
+    return plots.draw_panels([panel], path, title, "; ".join(notes))
 
 
-def numbers(rows: Sequence[Mapping[str, Any]], kinds: Sequence[str], path: Path, title: str, game: str):
+def numbers(
+    rows: Sequence[Mapping[str, Any]], kinds: Sequence[str], path: Path, title: str, game: str = ""
+) -> Path | None:
     """Draws numbers of rows that have no picture of their own, a panel each.
 
     Keys that differ in the name of an objective, or of a variable, alone share one: diag/error/*/moving. Of a
@@ -120,11 +123,11 @@ def numbers(rows: Sequence[Mapping[str, Any]], kinds: Sequence[str], path: Path,
     Returns:
         The path, or None if there is nothing to draw (then nothing is written).
     """
-    keys = sorted({key for row in rows for key in row} - {of_rows.STEPS})
+    known = sorted({key for row in rows for key in row})
+    elsewhere = (of_rows.STEPS, of_rows.DECODER_NOW, of_rows.ENCODER_NOW)  # in `drift_matrix`
+    keys = [key for kind in kinds for key in known if key.partition("/")[0] == kind]
     panels: dict[str, list[plots.Line]] = {}
-    for key in (key for kind in kinds for key in keys if key.partition("/")[0] == kind):
-        if key.startswith((of_rows.DECODER_NOW, of_rows.ENCODER_NOW)):  # in `drift_matrix`
-            continue
+    for key in (key for key in keys if not key.startswith(elsewhere)):
         name, label = key, "this run"
         if key.startswith("diag/") and key.count("/") > 1:
             diag, measure, label, *rest = key.split("/")
@@ -133,25 +136,29 @@ def numbers(rows: Sequence[Mapping[str, Any]], kinds: Sequence[str], path: Path,
         if any(isinstance(row.get(key), list) for row in rows):
             ends = {", first kept": 0, ", last kept": -1}
         for end, place in ends.items():
-            curve = _curve(rows, key, place)
-            if len(curve.at):
+            if (curve := _curve(rows, key, place)) is not None:
                 panels.setdefault(name, []).append(plots.Line(label + end, curve))
     for name, lines in panels.items():
         if len(lines) > MOST_LINES:
             panels[name] = [line for line in lines if line.label == "mean"] or lines
     if not panels:
         return None
-    shown = [plots.Panel(game, lines, title=name, log=True) for name, lines in panels.items()]
+    shown = [
+        plots.Panel(game, lines, title=name, log=any(word in name for word in LOGARITHMIC))
+        for name, lines in panels.items()
+    ]
     return plots.draw_panels(shown, path, title, label="")
 
 
-def _curve(rows: Sequence[Mapping[str, Any]], key: str, place: int) -> plots.Curve:
-    """A key's values, or an element's of its lists, without nulls."""
+def _curve(rows: Sequence[Mapping[str, Any]], key: str, place: int) -> plots.Curve | None:
+    """A key's values, or an element's of its lists, without nulls; None if there are none."""
     found = [(row["env_steps"], row[key]) for row in rows if row.get(key) not in (None, [])]
     found = [(at, value[place] if isinstance(value, list) else value) for at, value in found]
-    at, values = np.array([x for x in found if x[1] is not None], float).reshape(-1, 2).T
-    window = max(len(at) // 25, 1)
-    at, values = (np.lib.stride_tricks.sliding_window_view(x, min(window, len(x))) for x in (at, values))
+    found = [(at, value) for at, value in found if value is not None]
+    if not found:
+        return None
+    window = max(len(found) // 25, 1)
+    at, values = np.lib.stride_tricks.sliding_window_view(np.array(found, float).T, window, axis=1)
     return plots.Curve(at.mean(1), values.mean(1), values.min(1), values.max(1))
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import collect, plots, report
+from experiments import collect, images, plots, report
 from experiments import flags as config_flags
 from experiments.collect import RunData
 from experiments.reporting import browser, configs, overview
@@ -117,9 +117,9 @@ def runs(tmp_path_factory):
             own |= {"steps": 300} if seed == 0 else {"steps": 300, "eval_games": 10}
         write_run(place, returns, speed=speed, diag=diag, seed=seed, **own)
     frames = np.zeros((30, 42, 42, 1), np.uint8)
-    plots.gif(frames, root / "Catch/rl/seed0/figures/play.gif")
+    images.gif(frames, root / "Catch/rl/seed0/figures/play.gif")
     image = np.zeros((2, 8, 8, 1), np.float32)
-    plots.image_panel(image, image, image, root / "Catch/joint/seed0/figures/reconstruction.png", "")
+    images.image_panel(image, image, image, root / "Catch/joint/seed0/figures/reconstruction.png", "")
     shutil.copytree(root / "Catch/joint/seed0/figures", root / "figures")
     about = {"figure": "6.3", "title": "Joint <script>", "question": "Does it help?"}
     (root / "figures/reconstruction.json").write_text(json.dumps(about))
@@ -410,7 +410,7 @@ def test_large_pictures_are_made_smaller(tmp_path, noise):
     rng = np.random.default_rng(0)
     shape = (40, 42, 42, 1)
     frames = rng.integers(0, 256, shape, dtype=np.uint8) if noise else np.zeros(shape, np.uint8)
-    path = plots.gif(frames, tmp_path / "play.gif", scale=2)
+    path = images.gif(frames, tmp_path / "play.gif", scale=2)
     limit = 25_000 if noise else path.stat().st_size
     found = pictures.taken(path, limit)
     with Image.open(io.BytesIO(base64.b64decode(found.source.partition(",")[2]))) as image:
