@@ -97,7 +97,7 @@ def _labels(arms: Sequence[Arm]) -> list[str]:
         longer = [f"{old}, {flag}={x}".removeprefix(", ") for old, x in zip(labels, values, strict=True)]
         if len(set(longer)) > len(set(labels)):
             labels = longer
-    if max(map(len, labels)) > LONGEST:
+    if not all(0 < len(label) <= LONGEST for label in labels):
         labels = [arm.name for arm in arms]
     for other in ([arm.name for arm in arms], [arm.place for arm in arms]):
         if len({(arm.game, label) for arm, label in zip(arms, labels, strict=True)}) < len(arms):
