@@ -39,22 +39,21 @@ def image_panel(
         ValueError: if the shapes differ or the images are not float.
     """
     given = [np.asarray(images) for images in (inputs, targets, outputs)]
-    alike = len({images.shape for images in given}) == 1
-    if not alike or given[0].ndim != 4 or given[0].shape[3] not in CHANNELS or not given[0].size:
-        shapes = ", ".join(str(images.shape) for images in given)
-        raise ValueError(f"images must be [B, H, W, 1] or [B, H, W, 3], all of one shape; got {shapes}")
-    if not all(np.issubdtype(images.dtype, np.floating) for images in given):
-        raise ValueError("images must be float in [0, 1]")
+    forms = {(images.shape, np.issubdtype(images.dtype, np.floating)) for images in given}
+    shape, floating = next(iter(forms))
+    if len(forms) > 1 or not floating or len(shape) != 4 or shape[3] not in CHANNELS or 0 in shape:
+        got = ", ".join(f"{images.dtype} {images.shape}" for images in given)
+        raise ValueError(f"images must be float [B, H, W, 1] or [B, H, W, 3], all of one shape; got {got}")
     shown = [images[:MAX_EXAMPLES].astype(np.float32) for images in given]
-    difference = np.abs(shown[2] - shown[1]).max(-1, keepdims=True)
-    top = float(difference.max()) or 1.0
-    forms = [("input", "gray", 1.0), ("target", "gray", 1.0), ("output", "gray", 1.0)]
-    forms.append(("|output - target|", "inferno", top))
+    shown.append(np.abs(shown[2] - shown[1]).max(-1, keepdims=True))
+    top = float(shown[3].max()) or 1.0
 
-    count = len(difference)
+    count = len(shown[0])
     figure = plots.new_figure(1.15 * 4 + 0.9, 1.15 * count + 0.75)
     axes = figure.subplots(count, 4, squeeze=False)
-    for column, ((name, colours, most), images) in enumerate(zip(forms, [*shown, difference], strict=True)):
+    names = ("input", "target", "output", "|output - target|")
+    for column, (name, images) in enumerate(zip(names, shown, strict=True)):
+        colours, most = ("inferno", top) if column == 3 else ("gray", 1)
         for cell, image in zip(axes[:, column], images, strict=True):
             pixels = image[..., 0] if image.shape[-1] == 1 else image.clip(0, 1)
             drawn = cell.imshow(pixels, cmap=colours, vmin=0, vmax=most)

@@ -1,9 +1,7 @@
 """Pictures of curves: panels of lines with their bands, and the differences of arms from a baseline.
 
-`run_figures` says what is drawn of one run, `figures` and `compare` of several; `colours` which arm has which
-colour, and `images` draws frames. matplotlib and Pillow are the extra `plots` and are imported where they
-are used; `available()` says whether they can be. Figures are built as objects, without pyplot: no global
-state and no display.
+matplotlib and Pillow are the extra `plots` and are imported where they are used; `available()` says
+whether they can be. Figures are built as objects, without pyplot: no global state and no display.
 """
 
 import importlib.util
@@ -22,7 +20,6 @@ from srl_jax.data import reference_policies
 from .colours import Style, styles
 
 STEPS_LABEL = "env steps"
-THESIS = "the thesis' own, one run each"
 NEAR = 0.02
 """Of an axis: reference policies that are as near to each other as that share a line."""
 
@@ -45,8 +42,7 @@ class Line(NamedTuple):
     Attributes:
         label: in the legend; the same arm has the same one in all panels.
         curve: may have no points.
-        seeds: how many it is the mean of; 0 is not told. The band of fewer than two is no interval: it is
-            shown whole.
+        seeds: whose mean it is; 0 is not told. The band of fewer than two is no interval: it is shown whole.
         thesis: (env steps, returns) of the thesis' own curve, or None.
     """
 
@@ -76,10 +72,8 @@ class Panel(NamedTuple):
     Attributes:
         game: what an env step is of; "" for none.
         lines: see `Line`.
-        levels: published results, dotted.
-        policies: which learn nothing, dash-dotted.
-        title: above it; the game, where it is empty.
-        across: the name of the horizontal axis; env steps of the game, where it is empty.
+        levels, policies: published results, dotted, and policies that learn nothing, dash-dotted.
+        title, across: above it and below; empty for the game and its env steps.
         limits: of the vertical axis; None for what `heights` gives.
         log: whether that is logarithmic, where all values are positive and span a factor of 5 or more.
     """
@@ -135,85 +129,67 @@ def draw_panels(
     """
     columns = min(len(panels), 3)
     rows = -(-len(panels) // columns)
-    seeds: dict[str, set[int]] = {}
-    for line in (line for panel in panels for line in panel.lines):
-        seeds.setdefault(line.label, set()).add(line.seeds)
-    looks = looks or styles(list(seeds))
+    labels = dict.fromkeys(line.label for panel in panels for line in panel.lines)
+    looks = looks or styles(list(labels))
     width = 4.6 if columns > 1 else 6.4
-    figure = new_figure(*(size or (width * columns, 3.5 * rows + 0.24 * len(seeds) + 0.7)))
+    figure = new_figure(*(size or (width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)))
     handles: dict[str, Any] = {}
     for i, panel in enumerate(panels):
         axes = figure.add_subplot(rows, columns, i + 1, ylabel=label)
-        handles |= _draw_panel(axes, panel, looks, seeds)
+        handles |= _draw_panel(axes, panel, looks)
     if not size:
         _below(figure, int(17 * width * columns), handles, panels, note)
-        if title:
-            figure.suptitle(title, fontsize=11).set_parse_math(False)
+    if title:
+        figure.suptitle(title, fontsize=11).set_parse_math(False)
     return save(figure, path)
 
 
-def _draw_panel(
-    axes, panel: Panel, looks: Mapping[str, Style], seeds: Mapping[str, set[int]]
-) -> dict[str, Any]:
+def _draw_panel(axes, panel: Panel, looks: Mapping[str, Style]) -> dict[str, Any]:
     """Draws one panel; returns {text of the legend: its line}."""
-    axes.set_title(panel.title or panel.game, fontsize=10, parse_math=False)
+    axes.set_title(textwrap.fill(panel.title or panel.game, 36), fontsize=10, parse_math=False)
     axes.set_xlabel(across := panel.across or steps_label(panel.game))
     lines = [line for line in panel.lines if len(line.curve.at)]
     end = max((max(line.curve.at) for line in lines), default=1) or 1
     handles = {}
-    for label, curve, _, thesis in lines:
+    for label, curve, seeds, thesis in lines:
         colour, pattern = looks[label]
         axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0)
-        form = {"color": colour, "linewidth": 1.8, "marker": "o" if len(curve.at) == 1 else ""}
-        (handle,) = axes.plot(curve.at, curve.point, pattern, **form)
-        handles[f"{label}{_seeds(seeds[label])}"] = handle
+        marker = "o" if len(curve.at) == 1 else ""
+        (drawn,) = axes.plot(curve.at, curve.point, pattern, color=colour, linewidth=1.8, marker=marker)
+        handles[f"{label} ({seeds} seed{'' if seeds == 1 else 's'})" if seeds else label] = drawn
         if thesis is not None:
             steps, returns = (np.asarray(x, float) for x in thesis)
             at = np.unique(np.minimum(steps, end))
-            (dashed,) = axes.plot(
-                at, np.interp(at, steps, returns), "--", color=colour, linewidth=1.2, alpha=0.8
-            )
-            handles[THESIS] = dashed
+            returns = np.interp(at, steps, returns)
+            axes.plot(at, returns, "--", color=colour, linewidth=1.2, alpha=0.8)
     if across.startswith(STEPS_LABEL):
         count_axis(axes)
         axes.set_xlim(0, end)
     else:
         plain(axes)
-    whole = [x for line in lines if line.seeds < 2 for x in (line.curve.low, line.curve.high)]
-    shown = np.concatenate(
-        [
-            *(line.get_ydata() for line in axes.lines),
-            *whole,
-            [x.score for x in (*panel.levels, *panel.policies)],
-        ]
-    )
+    shown = [line.get_ydata() for line in axes.lines]
+    shown += [x for line in lines if line.seeds < 2 for x in (line.curve.low, line.curve.high)]
+    shown = np.concatenate([*shown, [x.score for x in (*panel.levels, *panel.policies)]])
     if panel.log and len(shown) and 0 < 5 * np.nanmin(shown) <= np.nanmax(shown):
-        _log_axis(axes, np.nanmax(shown) / np.nanmin(shown))
+        axes.set_yscale("log")
     elif np.isfinite(shown).any():
         axes.set_ylim(*(panel.limits or heights([line.curve for line in lines], shown)))
     levels(axes, {x.method: x.score for x in panel.policies}, panel.levels)
     return handles
 
 
-def _seeds(counts: set[int]) -> str:
-    """Behind a label."""
-    if counts == {0}:
-        return ""
-    return f" ({' or '.join(map(str, sorted(counts)))} seed{'' if counts == {1} else 's'})"
-
-
 def _below(figure, width: int, handles: dict[str, Any], panels: Sequence[Panel], note: str) -> None:
     """The legend and the notes, which are `width` characters wide."""
     from matplotlib.lines import Line2D
 
-    if THESIS in handles:  # last, and in no arm's colour
-        del handles[THESIS]
-        handles[THESIS] = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
     notes = note.splitlines()
     for panel in panels:
         told = [x._replace(method=f"{x.method} policy") for x in panel.policies] + list(panel.levels)
         notes += [f"{panel.game}, {x.method}, {x.score:g}: {x.differs}" for x in told if x.differs]
     notes = [line for text in notes for line in textwrap.wrap(text, width, subsequent_indent="    ")]
+    if any(line.thesis is not None for panel in panels for line in panel.lines):  # in no arm's colour
+        grey = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
+        handles = {**handles, "the thesis' own, one run each": grey}
     legend = figure.legend(
         handles.values(),
         handles.keys(),
@@ -360,17 +336,6 @@ def levels(axes, policies: Mapping[str, float], others: Sequence[Level] = ()) ->
             parse_math=False,
         )
         text.set_in_layout(False)
-
-
-def _log_axis(axes, span: float) -> None:
-    """A logarithmic axis of values; the largest is `span` times the smallest."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.set_yscale("log")
-    if span < 100:  # too narrow for powers of ten alone to say much
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def save(figure, path: str | os.PathLike) -> Path:

@@ -63,10 +63,10 @@ def test_image_panel_of_noise_is_still_small_and_a_perfect_output_is_fine(tmp_pa
 )
 def test_image_panel_refuses_other_images(tmp_path, shape, dtype):
     good = np.zeros((1, 84, 84, 1), np.float32)
-    with pytest.raises(ValueError, match="images must be"):
+    with pytest.raises(ValueError, match="images must be float"):
         images.image_panel(good, np.zeros(shape, dtype), good, tmp_path / "panel.png", "x")
     four = np.zeros((1, 84, 84, 4), np.float32)
-    with pytest.raises(ValueError, match=r"images must be \[B, H, W, 1\] or \[B, H, W, 3\]"):
+    with pytest.raises(ValueError, match=r"images must be float \[B, H, W, 1\] or \[B, H, W, 3\]"):
         images.image_panel(four, four, four, tmp_path / "panel.png", "x")
 
 
