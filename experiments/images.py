@@ -1,12 +1,10 @@
-"""Pictures of frames: what objectives make of observations, games as GIFs, and smaller files of both.
+"""Pictures of frames: what objectives make of observations, and games as GIFs.
 
 Pillow and matplotlib are imported where they are used, see `plots.available`.
 """
 
-import io
 import os
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -66,17 +64,14 @@ def image_panel(
     return plots.save(figure, path)
 
 
-def gif(frames: np.ndarray, file: Any, fps: float = 15, scale: int = 3) -> Any:
-    """Writes frames as a GIF that repeats for ever.
+def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int = 3) -> Path:
+    """Writes frames as a GIF that repeats for ever; returns the path, whose directory it makes.
 
     Args:
         frames: uint8 [T, H, W, C], C of 1 (grey) or 3 (RGB), T at least 1.
-        file: a path, whose directory is made where there is none, or a binary file.
+        path: of the file.
         fps: frames a second; a GIF counts in hundredths of a second, and is rounded to them.
         scale: every pixel becomes a square of this many pixels a side.
-
-    Returns:
-        The path, or the file.
 
     Raises:
         ValueError: for another shape or dtype.
@@ -89,35 +84,8 @@ def gif(frames: np.ndarray, file: Any, fps: float = 15, scale: int = 3) -> Any:
         raise ValueError(f"frames must be uint8 [T, H, W, 1] or [T, H, W, 3], T at least 1; got {got}")
     frames = frames.repeat(scale, axis=1).repeat(scale, axis=2)
     first, *others = [Image.fromarray(frame[..., 0] if frame.shape[-1] == 1 else frame) for frame in frames]
-    if isinstance(file, str | os.PathLike):
-        Path(file).parent.mkdir(parents=True, exist_ok=True)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     duration = 10 * max(round(100 / fps), 2)  # milliseconds; browsers slow down a GIF with shorter frames
-    first.save(file, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
-    return file
-
-
-def smaller_gif(image: Any, limit: int) -> bytes:
-    """A GIF in fewer bytes: without what scaling up has added, then with every second frame, which plays as
-    fast, then without the last ones.
-
-    Args:
-        image: of Pillow.
-        limit: of bytes, which is kept to down to a single frame.
-    """
-    from PIL import ImageSequence
-
-    frames = np.stack([np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(image)])
-    if (frames == frames[..., :1]).all():
-        frames = frames[..., :1]
-    while np.array_equal((half := frames[:, ::2, ::2]).repeat(2, axis=1).repeat(2, axis=2), frames):
-        frames = half
-    fps = 1000 / (image.info.get("duration") or 70)
-
-    def data() -> bytes:
-        return gif(frames, io.BytesIO(), fps, scale=1).getvalue()
-
-    if len(data()) > limit and len(frames) > 1:
-        frames, fps = frames[::2], fps / 2
-    while (size := len(data())) > limit and len(frames) > 1:
-        frames = frames[: max(1, min(len(frames) - 1, len(frames) * limit // size))]
-    return data()
+    first.save(path, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    return path

@@ -93,9 +93,9 @@ def learning_curve(
     if not evals:
         return None
     games = [np.array(row.get("eval/returns") or [np.nan], float) for row in evals]
-    means = np.array([row["eval/return_mean"] for row in evals], float)
-    low, high = np.array([(game.min(), game.max()) for game in games]).T
-    curve = plots.Curve([row["env_steps"] for row in evals], means, low, high)
+    points = [(row["env_steps"], row["eval/return_mean"]) for row in evals]
+    bands = [(game.min(), game.max()) for game in games]
+    curve = plots.Curve(*np.array(points, float).T, *np.array(bands).T)
     counts = sorted({len(game) for game in games if np.isfinite(game).all()})
     notes = [f"band: worst to best of {' or '.join(map(str, counts))} games"] if counts else []
     notes += [f"dashed: the thesis, figure {figure}, {arm} (one run)"] if thesis else []

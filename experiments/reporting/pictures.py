@@ -11,23 +11,11 @@ from srl_jax import statistics
 from srl_jax.errors import ConfigError
 from srl_jax.reading import read_bytes
 
-from .. import images, plots
+from .. import plots
 from ..colours import Style
-from ..plots import Curve, heights
-from ..plots import interval_curve as interval_curves
+from ..plots import Curve
 
-__all__ = [
-    "Curve",
-    "Picture",
-    "curves",
-    "differences",
-    "drawn",
-    "heights",
-    "interval_curves",
-    "picture",
-    "taken",
-]
-
+heights, interval_curves = plots.heights, plots.interval_curve
 LARGEST = 1 << 24
 """Bytes that a picture on disk may have."""
 ARMS_A_PICTURE = 6
@@ -35,13 +23,7 @@ ARMS_A_PICTURE = 6
 
 
 class Picture(NamedTuple):
-    """A picture within a page.
-
-    Attributes:
-        source: a data URI.
-        size: width and height in pixels.
-        bytes: of the file.
-    """
+    """A picture within a page: a data URI, its width and height in pixels, and the bytes of the file."""
 
     source: str
     size: tuple[int, int]
@@ -57,7 +39,7 @@ def drawn(draw: Callable[[Path], object]) -> Picture | None:
 
 
 def picture(data: bytes, name: str, limit: int = LARGEST) -> Picture:
-    """A PNG or GIF as it is, or a GIF in fewer bytes, see `images.smaller_gif`.
+    """A PNG or GIF as it is; of a GIF with more bytes than the limit, the first frames.
 
     Raises:
         ConfigError: it is none; `name` is the file's.
@@ -67,11 +49,25 @@ def picture(data: bytes, name: str, limit: int = LARGEST) -> Picture:
     try:
         with Image.open(io.BytesIO(data), formats=("PNG", "GIF")) as image:
             if image.format == "GIF" and len(data) > limit:
-                return picture(images.smaller_gif(image, limit), name)
+                return picture(_first_frames(image, limit), name)
             kind, size = image.get_format_mimetype(), image.size
     except (OSError, ValueError, SyntaxError, EOFError, Image.DecompressionBombError):
         raise ConfigError(f"{name}: neither a PNG nor a GIF, or damaged") from None
     return Picture(f"data:{kind};base64,{base64.b64encode(data).decode()}", size, len(data))
+
+
+def _first_frames(image, limit: int) -> bytes:
+    """As many frames of a GIF as the limit has room for, one at least, each for as long as it was shown."""
+    from PIL import ImageSequence
+
+    frames = [frame.copy() for frame in ImageSequence.Iterator(image)]
+    while True:
+        file, first = io.BytesIO(), frames[0]
+        durations = [frame.info.get("duration", 70) for frame in frames]
+        first.save(file, "GIF", save_all=True, append_images=frames[1:], loop=0, duration=durations)
+        if file.tell() <= limit or len(frames) == 1:
+            return file.getvalue()
+        del frames[max(1, min(len(frames) - 1, len(frames) * limit // file.tell())) :]
 
 
 def taken(path: Path, limit: int) -> Picture | None:
@@ -98,14 +94,13 @@ def curves(
     policies: Mapping[str, float] | None = None,
     limits: tuple[float, float] | None = None,
 ) -> Picture:
-    """A picture of one number against another, mostly env steps; which line is whose is said beside it.
+    """A picture of one number against another; which line is whose is said beside it.
 
     Args:
         title: above it.
         lines: an arm's style and its curve.
         size: width and height in inches.
-        label: of the vertical axis.
-        across: of the horizontal axis; env steps where it is empty.
+        label, across: of the axes; empty across for env steps.
         policies: name -> mean return of reference policies.
         limits: of the vertical axis; None for what `heights` gives.
     """
