@@ -211,7 +211,7 @@ def compare(values: flags.FlagValues) -> None:
     """
     if not values["runs"].value:
         raise ConfigError("--runs: missing; name two, srl-jax compare runs/a runs/b")
-    roots = [Path(os.path.expanduser(root)) for root in values["runs"].value]
+    roots = list(dict.fromkeys(Path(os.path.expanduser(root)) for root in values["runs"].value))
     key, out = values["key"].value, values["out"].value
     path = config_flags.check_file("out", out, ".png", overwrite=values["overwrite"].value) if out else None
     if path and not plots.available():

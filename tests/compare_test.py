@@ -116,12 +116,16 @@ def test_packed_runs_and_folders_of_arms_are_read_alike(runs, tmp_path, capsys):
     [
         ((), "--runs: missing; name two"),
         (("a",), "--runs=.*a: one curve; name a second run"),
+        (("a", "a/"), "--runs=.*a: one curve; name a second run"),
         (("a", "nothing"), "nothing: no run directory there"),
         (("a", "b", "--key=eval/return_men"), "no run has it; there are eval/return_mean"),
         (("a", "c", "--key=text"), "c: text is not a number in each row"),
         (("a", "pong"), "of different games, Catch, Pong; --force compares"),
         (("a", "noisy"), "another protocol than .*eps_eval is 0.005 there and 0.5 here; --force"),
-        (("failed", "failed"), "nothing to draw; Catch, failed: 1 of 1 seed left out: loss/rl is not finite"),
+        (
+            ("failed", "failed/../failed"),
+            "nothing to draw; Catch, failed: 1 of 1 seed left out: loss/rl is not finite",
+        ),
         (("a", "b", "--out=x.jpg"), "--out=x.jpg: must end in .png"),
         (("a", "b", "--out=there.png"), "there.png: exists; name a new file, or --overwrite replaces it"),
     ],
