@@ -193,7 +193,7 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
         SaveError: they cannot be written.
     """
     from . import plots
-    from .draw import draw_run
+    from .run_figures import draw_run
 
     if not plots.available():
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")

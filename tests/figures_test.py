@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import collect, curves, figures
+from experiments import collect, figures, plots
 from experiments import flags as config_flags
 from experiments.arms import FIGURES, Figure, FigureArm
 from experiments.reporting.numbers import arms_of, compare, table
@@ -131,7 +131,7 @@ def test_an_arm_of_which_all_seeds_failed_is_listed(runs, tmp_path):
 def drawn_notes(monkeypatch):
     """The lines below the figures that would have been drawn."""
     notes = []
-    monkeypatch.setattr(figures.curves, "comparison", lambda *given: notes.append(given[3].splitlines()))
+    monkeypatch.setattr(plots, "draw_panels", lambda *given: notes.append(given[3].splitlines()))
     return notes
 
 
@@ -280,7 +280,7 @@ def test_policies_that_learn_nothing_are_in_the_json_and_drawn(runs, monkeypatch
     assert all(x["source"].startswith("python -m experiments.") for x in policies.values())
     assert all(x["differs"] == "" for x in policies.values())
     given = []
-    monkeypatch.setattr(curves, "comparison", lambda *values: given.extend(values))
+    monkeypatch.setattr(plots, "draw_panels", lambda *values: given.extend(values))
     figures.draw(FIGURE, numbers, runs / "x.png")
     panels, _, _, note, _ = given
     assert "intervals over seeds at each point, Student's t; dash-dotted: policies that learn nothing" in note

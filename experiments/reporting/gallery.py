@@ -1,11 +1,9 @@
 """The pictures of a report: of what is measured over env steps, and of what the runs' directories hold."""
 
-import base64
 import csv
 import fnmatch
 import functools
 import importlib.resources
-import io
 import itertools
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -18,7 +16,7 @@ from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.reading import parse_json
 
-from .. import diagnostic_plots, plots
+from .. import plots, run_figures
 from ..collect import RunData
 from ..colours import Style
 from ..directories import natural
@@ -33,8 +31,6 @@ OWN = ("learning_curve", "losses", "diagnostics", "drift")
 """Pictures of a run that a report draws itself."""
 MANY = pictures.ARMS_A_PICTURE
 """Arms up to which a picture of all of them can be read."""
-COLUMN = 360
-"""Pixels: the width of a column of the page."""
 SIZE = (4.4, 3.1)
 """Inches of a picture of a whole section: wide enough for many lines, and legible on a phone."""
 FAINT = "50"
@@ -224,7 +220,7 @@ def drift(runs: Iterable[RunData]) -> list[Shown]:
     """The error of each epoch's decoder on each epoch's encoder, a picture a run."""
     shown = []
     for run in runs:
-        picture = pictures.drawn(functools.partial(diagnostic_plots.drift_matrix, run.rows, title=""))
+        picture = pictures.drawn(functools.partial(run_figures.drift_matrix, run.rows, title=""))
         if picture is not None:
             caption = f"seed {run.seed}: each epoch's decoder on each epoch's encoder"
             shown.append(Shown(picture, f"{run.game} / {run.arm}: drift", run.arm, caption))
@@ -248,20 +244,6 @@ def own_pictures(games: Iterable[numbers.Game]) -> dict[str, dict[str, list[Show
     shown: dict[str, dict[str, list[Shown]]] = {}
     for run, path in found:
         name, kinds = f"seed {run.seed}: {path.stem}", shown.setdefault(run.game, {"gif": [], "png": []})
-        picture = _smaller(pictures.taken(path, limit), limit)
+        picture = pictures.taken(path, limit)
         kinds[path.suffix[1:]].append(Shown(picture, f"{run.game} / {run.arm} / {name}", run.arm, name))
     return shown
-
-
-def _smaller(picture: Picture, limit: int) -> Picture:
-    """A WebP as wide as a column of the page, in place of a JPEG that has more bytes than the limit."""
-    if picture.bytes <= limit or "jpeg" not in picture.source[:20]:
-        return picture
-    from PIL import Image
-
-    file = io.BytesIO()
-    with Image.open(io.BytesIO(base64.b64decode(picture.source.partition(",")[2]))) as image:
-        image.thumbnail((COLUMN, image.height))
-        image.save(file, format="WEBP", quality=40, method=6)
-        source = f"data:image/webp;base64,{base64.b64encode(file.getvalue()).decode()}"
-        return Picture(source, image.size, len(file.getvalue()))
