@@ -12,9 +12,8 @@ import pytest
 
 from experiments.sweeping import launching, table
 from srl_jax import display
-from srl_jax.display import Display
+from srl_jax.display import Display, Progress
 from srl_jax.errors import SaveError
-from srl_jax.progress import Progress
 from tests.helpers import SMALL
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]

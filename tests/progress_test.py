@@ -2,7 +2,7 @@ import io
 
 import pytest
 
-from srl_jax.progress import Progress, hms
+from srl_jax.display import Progress, hms
 
 
 class Clock:

@@ -115,7 +115,7 @@ def _fields(config: Config) -> dict[str, str]:
             continue
         if field in SPECIFICATIONS:
             found |= _options(field, value)
-        elif field == "imports":
+        elif field in ("imports", "loggers"):
             found[field] = ", ".join(Path(text).name for text in value) or "none"
         elif value and field in collect.OF_A_SEED:
             found[field] = source_name(value)
