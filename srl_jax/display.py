@@ -74,7 +74,7 @@ class Display:
         return None
 
 
-class Lines:
+class _Lines:
     """A stream for a bar where nothing can be drawn over: each state that is drawn becomes a line.
 
     Args:
@@ -119,7 +119,7 @@ class Progress:
                 total=self._total,
                 unit=f" {self._unit}",
                 initial=done,
-                file=self._stream if self._tty else Lines(self._write),
+                file=self._stream if self._tty else _Lines(self._write),
                 mininterval=interval,
                 miniters=0,  # ask the clock at each update: their rate is not steady
                 smoothing=interval / 30,  # the rate is of about the last 30 seconds
