@@ -100,7 +100,7 @@ def _listed(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     for place, (name, options) in enumerate(rows.items()):
         line = specs.join(name, options)
         for other in list(rows)[:place]:
-            if rows[other].keys() == options.keys():
+            if options and rows[other].keys() == options.keys():
                 differing = {key: x for key, x in options.items() if x != rows[other][key]}
                 line = f"{name}: {specs.join(other, differing)}"
                 break
