@@ -220,8 +220,8 @@ class Config:
     pretrain_epsilon: float = _share(0.3, "epsilon of the behaviour policy in --mode=pretrain")
     imports: tuple[str, ...] = _value(
         tuple, (),
-        "file (my_file.py) or module that registers objectives, encoders, RL algorithms or loggers of your own, "
-        "see srl_jax/plugins.py; may be repeated",
+        "file (my_file.py) or module that registers own objectives, encoders, RL algorithms or loggers, see "
+        "srl_jax/plugins.py; may be repeated",
         flag="import",
     )  # fmt: skip
 
