@@ -24,7 +24,7 @@ RETURN = "eval/return_mean"
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
-OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports")
+OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", "loggers")
 """Fields in which runs of one arm and game may differ."""
 
 

@@ -20,8 +20,8 @@ from absl import flags
 
 from srl_jax import display, envs, rundir
 from srl_jax.config import INFOS, Config
+from srl_jax.display import hms
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.progress import hms
 from srl_jax.specs import Info, value_text
 
 from . import collect

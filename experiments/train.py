@@ -8,7 +8,6 @@ the run; a second Ctrl-C or SIGTERM ends it at once.
 import contextlib
 import dataclasses
 import functools
-import importlib.util
 import os
 import signal
 from collections.abc import Callable
@@ -84,8 +83,6 @@ def check_extras(config: Config) -> None:
         ConfigError: they cannot; the line says why, or which extra has the package.
     """
     check_game(config)
-    if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
-        raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
 
 
 def say_unused(values: flags.FlagValues, game: str) -> None:

@@ -97,7 +97,7 @@ def _fields(config: Config) -> dict[str, str]:
         value = getattr(config, field)
         if field in ("rl", "encoder", "objectives"):
             found |= _options(field, value)
-        elif field == "imports":
+        elif field in ("imports", "loggers"):
             found[field] = ", ".join(Path(text).name for text in value) or "none"
         elif value and field in ("encoder_from", "policy_from"):
             # The arm that the path of a run, or of a checkpoint in it, is of.

@@ -105,7 +105,7 @@ def _config_problem(path: Path, config: Config) -> str:
             return "config.json: not a JSON object"
     except (OSError, ValueError) as error:
         return f"config.json: {getattr(error, 'strerror', None) or error}"
-    names = [name for name in INFOS if name != "imports"]  # which may lie elsewhere by now
+    names = [name for name in INFOS if name not in ("imports", "loggers")]  # may be others by now
     if differing := difference(Config.load(path), config, names):
         raise ConfigError(
             f"{path}: the run there has another configuration: {differing}; give the flags that it was run "

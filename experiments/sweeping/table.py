@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import TextIO
 
 from srl_jax import checkpoint, ending, rundir
-from srl_jax.display import Display
+from srl_jax.display import Display, hms
 from srl_jax.errors import ConfigError
-from srl_jax.progress import hms
 
 from . import states
 from .launching import View
