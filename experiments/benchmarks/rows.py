@@ -1,245 +1,256 @@
-"""What is measured: workers, what each is asked once a round, and the rows of the table."""
+"""What is measured: groups of workers that take turns, and the rows of the table that their answers make.
 
-from collections.abc import Callable
+A series is named WORKER.NAME: what the worker's side returns as NAME from each turn. numpy only.
+"""
+
+import math
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from .table import Goal
+from .. import runtime
 
 
-class Side(NamedTuple):
+class Program(NamedTuple):
     """A worker.
 
     Attributes:
-        group: workers of one group are alive together and take turns.
-        module: of `experiments.benchmarks`.
-        arguments: of its command.
-        setup: the first request, {"do": ..., arguments}; of PyTorch's side without what it loads.
-        warm: requests whose replies are thrown away.
-        needs: the package that it is about, "" for this project.
-        twin: this project's worker whose weights it loads, and whose losses its own must equal.
-        rounds: takes part in at most so many.
-        seconds: roughly, of setting up and of a round, for the time left.
-    """
-
-    group: str
-    module: str
-    arguments: tuple[str, ...] = ()
-    setup: dict[str, Any] | None = None
-    warm: tuple[dict[str, Any], ...] = ()
-    needs: str = ""
-    twin: str = ""
-    rounds: int = 1_000_000
-    seconds: tuple[float, float] = (15.0, 3.0)
-
-
-class Series(NamedTuple):
-    """One thing that is measured.
-
-    Attributes:
-        side: the worker.
-        request: asked once a round; series of one worker with equal requests share the reply.
-        pick: the reply -> the round's repetitions, in the row's unit.
+        side: MODULE.CLASS of this package.
+        arguments: the class'.
+        turn: how much is done in a turn, {what is counted: number}.
+        twin: this project's worker whose weights it loads, and whose losses its own must equal; "" for none.
     """
 
     side: str
-    request: dict[str, Any]
-    pick: Callable[[dict[str, Any]], list[float]]
+    arguments: Mapping[str, Any]
+    turn: Mapping[str, int] = {}
+    twin: str = ""
+
+    @property
+    def is_other(self) -> bool:
+        """Whether it runs in the environment of `make bench-install`."""
+        return self.side.split(".")[0] in ("torch_side", "tianshou_side")
+
+
+class Spread(NamedTuple):
+    """A median over rounds and its quartiles, linearly interpolated."""
+
+    median: float
+    low: float
+    high: float
 
 
 class Row(NamedTuple):
-    """A row of the table.
+    """A row of the table, and its goals.
 
     Attributes:
         title, unit: shown.
         ours: a series.
-        theirs: {label: series}; see `table.figures`.
-        goals: as there.
-        speedup: as there.
+        theirs: {label: series}; of several the one with the least median counts, so they must be times.
+        faster: the least that the ratio should be, which is then that of theirs to ours for a time.
+        cost: the most that the ratio, ours to theirs, should be.
+        limit: the most that ours should be, in the unit.
     """
 
     title: str
     unit: str
     ours: str
-    theirs: dict[str, str]
-    goals: tuple[Goal, ...]
-    speedup: bool = False
+    theirs: Mapping[str, str] = {}
+    faster: float | None = None
+    cost: float | None = None
+    limit: float | None = None
+
+    @property
+    def goal(self) -> str:
+        """The goals in words; a ratio has no unit."""
+        found = [] if self.faster is None else [f">= {self.faster:g}"]
+        found += [] if self.cost is None else [f"<= {self.cost:g}"]
+        found += [] if self.limit is None else [f"<= {self.limit:g} {self.unit}"]
+        return ", ".join(found) or "-"
+
+    def figures(self, replies: Mapping[str, Sequence[Sequence[float]]]) -> dict[str, Any]:
+        """What the row shows.
+
+        Args:
+            replies: {series: the repetitions of each round}. What counts of a round is its median.
+
+        Returns:
+            "ours" and, where there is another side, "theirs" and "ratio", each a `Spread`; ratios are formed
+            round by round. "label", which of the other side's series counts; "met", whether the goals are.
+        """
+        medians = {name: [float(np.median(x)) for x in rounds] for name, rounds in replies.items()}
+        ours = medians[self.ours]
+        found: dict[str, Any] = {"ours": spread(ours), "theirs": None, "ratio": None, "label": ""}
+        if self.theirs:
+            label = min(self.theirs, key=lambda name: np.median(medians[self.theirs[name]]))
+            theirs = medians[self.theirs[label]]
+            of_times = self.faster is not None and not self.unit.endswith("/s")
+            ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
+            ratios = [1 / ratio for ratio in ratios] if of_times else ratios
+            found |= {"theirs": spread(theirs), "ratio": spread(ratios), "label": label}
+        ratio = found["ratio"].median if found["ratio"] else math.nan
+        met = (
+            self.faster is None or ratio >= self.faster,
+            self.cost is None or ratio <= self.cost,
+            self.limit is None or found["ours"].median <= self.limit,
+        )
+        return found | {"met": all(met)}
+
+    def cells(self, found: Mapping[str, Any] | None) -> list[str]:
+        """The line of the table; without figures it says that the row was skipped."""
+        if found is None:
+            return [self.title, "skipped", "not installed", "-", self.goal, "-"]
+        theirs = "-"
+        if found["theirs"]:
+            theirs = f"{spread_text(found['theirs'], self.unit)}, {found['label']}"
+        ratio = spread_text(found["ratio"]) if found["ratio"] else "-"
+        met = "-" if self.goal == "-" else "yes" if found["met"] else "no"
+        return [self.title, spread_text(found["ours"], self.unit), theirs, ratio, self.goal, met]
 
 
-def _scaled(name: str, factor: float) -> Callable[[dict[str, Any]], list[float]]:
-    return lambda reply: [factor * value for value in reply[name]]
+def spread(values: Sequence[float]) -> Spread:
+    """Of one figure a round."""
+    low, median, high = np.percentile(values, (25, 50, 75)).tolist()
+    return Spread(median, low, high)
 
 
-def _means_of_4(reply: dict[str, Any]) -> list[float]:
-    return (1e3 * np.reshape(reply["seconds"], (-1, 4)).mean(1)).tolist()
+def number(value: float) -> str:
+    """Three significant digits, without an exponent."""
+    return f"{value:.{max(0, 2 - math.floor(math.log10(abs(value))))}f}" if value else "0"
 
 
-def _rate(reply: dict[str, Any]) -> list[float]:
-    return [reply["env_steps"] / reply["seconds"]]
+def spread_text(found: Spread, unit: str = "") -> str:
+    """`median unit (low to high)`."""
+    middle = f"{number(found.median)} {unit}".strip()
+    return middle if found.low == found.high else f"{middle} ({number(found.low)} to {number(found.high)})"
 
 
-def _slower_part(reply: dict[str, Any]) -> list[float]:
-    return [1e3 * max(float(np.median(reply[name])) for name in ("acting", "update"))]
+class Group(NamedTuple):
+    """Workers that are alive together and take turns.
+
+    Attributes:
+        programs: {name: worker}; a twin comes before what loads from it.
+        rows: {name that --only takes: row}.
+        rounds: takes part in at most so many.
+    """
+
+    programs: Mapping[str, Program]
+    rows: Mapping[str, Row]
+    rounds: int = 1_000_000
+
+    def needed(self, rows: Sequence[str]) -> dict[str, Program]:
+        """The workers of some of its rows."""
+        series = {name for row in rows for name in (self.rows[row].ours, *self.rows[row].theirs.values())}
+        names = {name.split(".")[0] for name in series}
+        names |= {self.programs[name].twin for name in names}
+        return {name: program for name, program in self.programs.items() if name in names}
 
 
-ARMS = {
-    "nature": ("rl_only_nature", "separate"),
-    "256": ("rl_only_256", "separate"),
-    "joint": ("joint_256", "separate"),
-    "summed": ("joint_256", "summed"),
-}
-"""{short name: (arm of the thesis, how its encoder is stepped)} of the updates that are compared."""
+THREADS = runtime.cores()
+"""PyTorch's."""
 
-_UPDATES = {
-    "nature": 60,
-    "256": 24,
-    "joint": 12,
-    "summed": 12,
-    "simultaneous": 12,
-    "joint4": 16,
-}  # in a round
-_SECONDS = {"nature": (10, 1.5), "256": (20, 2), "joint": (35, 4), "summed": (35, 3)}
-FORMATS = ("contiguous", "channels_last")
-CHECK_UPDATES = 2
-"""Updates whose losses must be equal; the second one's depend on the first one's gradients."""
+FORMATS = {"PyTorch contiguous": "contiguous_format", "PyTorch channels last": "channels_last"}
+"""Of images and kernels."""
 
 
-def _ours(group: str, short: str, arm: str, **overrides: Any) -> Side:
-    return Side(
-        group,
-        "jax_side",
-        ("nature" if arm.endswith("nature") else "sac_ae",),
-        {"do": "setup", "preset": f"thesis/{arm}", **overrides},
-        ({"do": "time", "updates": 8},),
-        seconds=_SECONDS.get(short, _SECONDS["joint"]),
-    )
+def _ours(preset: str, updates: int, **overrides: Any) -> Program:
+    """An update in this project."""
+    return Program("jax_side.Updates", {"preset": preset, **overrides}, {"updates": updates})
 
 
-def _torch(group: str, short: str, arm: str, form: str, memory_format: str) -> Side:
-    return Side(
-        group,
-        "torch_side",
-        setup={"do": "setup", "arm": arm, "memory_format": memory_format, "encoder_optimizer": form},
-        warm=({"do": "time", "updates": 5},),
-        needs="torch",
-        twin=f"jax {short}",
-        seconds=(8, 1.8 * _SECONDS[short][1]),
-    )
+def _both(name: str, preset: str, updates: int, **overrides: Any) -> dict[str, Program]:
+    """An update in this project and, in each format, in PyTorch."""
+    found = {name: _ours(preset, updates, **overrides)}
+    for label, memory_format in FORMATS.items():
+        arguments = {"preset": preset, "threads": THREADS, "memory_format": memory_format, **overrides}
+        found[f"{name} {label}"] = Program("torch_side.Updates", arguments, {"updates": updates}, twin=name)
+    return found
 
 
-SIDES: dict[str, Side] = {}
-SERIES: dict[str, Series] = {}
-for _short, (_arm, _form) in ARMS.items():
-    _group = "nature" if _short == "nature" else "256"
-    SIDES[f"jax {_short}"] = _ours(_group, _short, _arm, encoder_optimizer=_form)
-    for _format in FORMATS:
-        SIDES[f"torch {_short} {_format}"] = _torch(_group, _short, _arm, _form, _format)
-SIDES["jax simultaneous"] = _ours("256", "simultaneous", "joint_256", encoder_optimizer="simultaneous")
-SIDES["jax joint4"] = _ours("256", "joint4", "joint_256", srl_every=4)
-for _name in SIDES:
-    _request = {"do": "time", "updates": _UPDATES[_name.split()[1]]}
-    SERIES[_name] = Series(_name, _request, _scaled("seconds", 1e3))
-SERIES["jax joint4"] = SERIES["jax joint4"]._replace(pick=_means_of_4)
-
-_LOOP = {"do": "setup", "preset": "thesis/rl_only_nature"}
-_REPLAY = {"do": "fill"}
-_STARTUP = {"do": "startup", "preset": "thesis/joint_256"}
-_MEMORY = {"do": "memory", "preset": "thesis/rl_only_nature", "updates_per_step": 0.005}
-_RUN = {"do": "run", "env_steps": 300}
-_PARTS = {"do": "parts", "iterations": 30}
-_SAMPLE = {"do": "sample", "repetitions": 1000}
-_INSERT = {"do": "insert", "steps": 200}
-SIDES |= {
-    "loop": Side("loop", "host_side", ("nature",), _LOOP, (_RUN,), seconds=(15, 4)),
-    "tianshou": Side("loop", "tianshou_side", (), {"do": "setup"}, (_RUN,), "tianshou", seconds=(15, 4)),
-    "replay": Side("replay", "host_side", ("nature",), _REPLAY, seconds=(10, 2)),
-    # The first start fills jax' cache.
-    "startup": Side("startup", "train_side", warm=(_STARTUP,), rounds=3, seconds=(25, 12)),
-    "memory": Side("memory", "train_side", rounds=1, seconds=(1, 120)),
-}
-SERIES |= {
-    "loop": Series("loop", _RUN, _rate),
-    "tianshou": Series("tianshou", _RUN, _rate),
-    "iteration": Series("loop", _PARTS, _scaled("iteration", 1e3)),
-    "slower part": Series("loop", _PARTS, _slower_part),
-    "busy": Series("loop", _PARTS, _scaled("busy", 1.0)),
-    "sample": Series("replay", _SAMPLE, _scaled("sample", 1e3)),
-    "gather": Series("replay", _SAMPLE, _scaled("gather", 1e3)),
-    "add": Series("replay", _INSERT, _scaled("add", 1e3)),
-    "env step": Series("replay", _INSERT, _scaled("step", 1e3)),
-    "startup": Series("startup", _STARTUP, _scaled("seconds", 1.0)),
-    "memory": Series("memory", _MEMORY, _scaled("bytes", 1e-9)),
-    "frames": Series("memory", _MEMORY, _scaled("frames", 1e-9)),
-}
+def _beside_pytorch(title: str, name: str, faster: float) -> Row:
+    """The row of what `_both` has."""
+    theirs = {label: f"{name} {label}.update" for label in FORMATS}
+    return Row(f"update {title}", "ms", f"{name}.update", theirs, faster=faster)
 
 
-def _update(short: str, title: str, least: float) -> Row:
-    theirs = {f"PyTorch {name.replace('_', ' ')}": f"torch {short} {name}" for name in FORMATS}
-    return Row(f"update {title}", "ms", f"jax {short}", theirs, (Goal("ratio", ">=", least),), speedup=True)
+def _cost(title: str, ours: str, theirs: str, label: str, cost: float | None = None) -> Row:
+    """The row of one update beside another one of this project."""
+    return Row(title, "ms", f"{ours}.update", {label: f"{theirs}.update"}, cost=cost)
 
 
-def _at_most(limit: float) -> tuple[Goal, ...]:
-    return (Goal("ratio", "<=", limit),)
+NATURE, JOINT = "thesis/rl_only_nature", "thesis/joint_256"
 
+UPDATE = Group(
+    _both("nature", NATURE, 60),
+    {"update_nature": _beside_pytorch("rl_only nature", "nature", 1.8)},
+)
 
-ROWS: dict[str, Row] = {
-    "update_nature": _update("nature", "rl_only nature", 1.8),
-    "update_256": _update("256", "rl_only 256", 1.25),
-    "update_joint": _update("joint", "joint 256, two Adams in turn", 1.3),
-    "update_summed": _update("summed", "joint 256, one Adam", 1.3),
-    "separate_cost": Row(
-        "two Adams in turn / one Adam, joint 256",
-        "ms",
-        "jax joint",
-        {"one Adam": "jax summed"},
-        _at_most(1.35),
-    ),
-    "simultaneous_cost": Row(
-        "two Adams at once / one Adam", "ms", "jax simultaneous", {"one Adam": "jax summed"}, ()
-    ),
-    "loop": Row(
-        "loop Pong nature", "env steps/s", "loop", {"Tianshou": "tianshou"}, (Goal("ratio", ">=", 2.5),)
-    ),
-    "overlap": Row(
-        "loop / slower part", "ms", "iteration", {"acting or update alone": "slower part"}, _at_most(1.12)
-    ),
-    "busy": Row("cores that the loop keeps busy", "cores", "busy", {}, ()),
-    "joint_cost": Row(
-        "joint, one Adam / rl_only, updates of 256", "ms", "jax summed", {"rl_only": "jax 256"}, _at_most(1.7)
-    ),
-    "joint_cost_4": Row(
-        "two Adams and srl_every=4 / rl_only", "ms", "jax joint4", {"rl_only": "jax 256"}, _at_most(1.2)
-    ),
-    "replay_sample": Row(
-        "replay sample + set priorities",
-        "ms",
-        "sample",
-        {"numpy gather": "gather"},
-        (*_at_most(2.0), Goal("ours", "<=", 0.3)),
-    ),
-    "replay_insert": Row("replay insert", "ms", "add", {"env step": "env step"}, _at_most(0.05)),
-    "startup": Row(
-        "start to first update, joint 256, warm cache", "s", "startup", {}, (Goal("ours", "<", 12.0),)
-    ),
-    "memory": Row(
-        "peak memory, buffer 100,000",
-        "GB",
-        "memory",
-        {"the frames alone": "frames"},
-        (Goal("ours", "<=", 1.6),),
-    ),
-}
-"""The table, in order; the keys are what --only takes."""
+UPDATES_OF_256 = Group(
+    {
+        **_both("256", "thesis/rl_only_256", 24),
+        **_both("joint", JOINT, 12),
+        **_both("summed", JOINT, 12, encoder_optimizer="summed"),
+        "simultaneous": _ours(JOINT, 12, encoder_optimizer="simultaneous"),
+        "joint4": _ours(JOINT, 4, srl_every=4),
+    },
+    {
+        "update_256": _beside_pytorch("rl_only 256", "256", 1.25),
+        "update_joint": _beside_pytorch("joint 256, two Adams in turn", "joint", 1.3),
+        "update_summed": _beside_pytorch("joint 256, one Adam", "summed", 1.3),
+        "separate_cost": _cost(
+            "two Adams in turn / one Adam, joint 256", "joint", "summed", "one Adam", 1.35
+        ),
+        "simultaneous_cost": _cost("two Adams at once / one Adam", "simultaneous", "summed", "one Adam"),
+        "joint_cost": _cost("joint, one Adam / rl_only, updates of 256", "summed", "256", "rl_only", 1.7),
+        "joint_cost_4": _cost("two Adams and srl_every=4 / rl_only", "joint4", "256", "rl_only", 1.2),
+    },
+)
 
+_RATE = "env_steps_per_s"
+LOOP = Group(
+    {
+        "loop": Program("host_side.Loop", {"preset": NATURE}, {"env_steps": 300, "iterations": 30}),
+        "tianshou": Program("tianshou_side.Loop", {"threads": THREADS}, {"env_steps": 300}),
+    },
+    {
+        "loop": Row(
+            "loop Pong nature", "env steps/s", f"loop.{_RATE}", {"Tianshou": f"tianshou.{_RATE}"}, faster=2.5
+        ),
+        "overlap": Row(
+            "loop / slower half",
+            "ms",
+            "loop.iteration",
+            {"acting or update alone": "loop.slower half"},
+            cost=1.12,
+        ),
+        "busy": Row("cores that the loop keeps busy", "cores", "loop.busy"),
+    },
+)
 
-def series_of(row: Row) -> list[str]:
-    """The series that a row is made of."""
-    return [row.ours, *row.theirs.values()]
+_SAMPLE, _INSERT = {"numpy gather": "replay.gather"}, {"env step": "replay.env step"}
+REPLAY = Group(
+    {"replay": Program("host_side.Replay", {"preset": NATURE}, {"samples": 1000, "inserts": 200})},
+    {
+        "replay_sample": Row(
+            "replay sample + set priorities", "ms", "replay.sample", _SAMPLE, cost=2.0, limit=0.3
+        ),
+        "replay_insert": Row("replay insert", "ms", "replay.add", _INSERT, cost=0.05),
+    },
+)
 
+STARTUP = Group(
+    {"run": Program("train_side.Startup", {"preset": JOINT})},
+    {"startup": Row("start to first update, joint 256, warm cache", "s", "run.startup", limit=12.0)},
+    rounds=3,
+)
 
-def sides_of(rows: list[str]) -> list[str]:
-    """The workers that rows need, in order; PyTorch's with the twin that they load from."""
-    names = {SERIES[series].side for row in rows for series in series_of(ROWS[row])}
-    names |= {SIDES[name].twin for name in names}
-    return [name for name in SIDES if name in names]
+_FRAMES = {"the frames alone": "run.frames"}
+MEMORY = Group(
+    {"run": Program("train_side.Memory", {"preset": NATURE}, {"buffer_size": 100_000})},
+    {"memory": Row("peak memory, buffer 100,000", "GB", "run.memory", _FRAMES, limit=1.6)},
+    rounds=1,
+)
+
+GROUPS = (UPDATE, UPDATES_OF_256, LOOP, REPLAY, STARTUP, MEMORY)
+"""The table, in order."""
