@@ -10,6 +10,7 @@ needs PyTorch or Tianshou runs in an environment of its own (`make bench-install
 import contextlib
 import datetime
 import json
+import math
 import os
 import platform
 import re
@@ -18,7 +19,6 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from absl import flags
@@ -42,23 +42,11 @@ TOLERANCE = 1e-4
 """Largest relative difference of two losses that count as equal."""
 BUSY = 0.5
 """Load average from which on other programs are warned of."""
-HEAD = ("name", "this project", "the other side", "ratio", "goal", "met?")
+HEAD = ("name", "this project", "the other side", "ratio", "goal")
 
 
 class CheckFailed(RuntimeError):
     """The two sides do not compute the same."""
-
-
-class Results(NamedTuple):
-    """What was found.
-
-    Attributes:
-        replies: {series: the repetitions of each round}.
-        checks: {worker: the largest relative difference of a loss from its twin's}.
-    """
-
-    replies: dict[str, list[list[float]]]
-    checks: dict[str, float]
 
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
@@ -139,7 +127,29 @@ def difference(ours: Sequence[Mapping[str, float]], theirs: Sequence[Mapping[str
     return found
 
 
-def measure(group: Group, rows: Sequence[str], rounds: int, python: str, quick: bool = False) -> Results:
+def start(group: Group, rows: Sequence[str], python: str, stack: contextlib.ExitStack) -> tuple[dict, dict]:
+    """Starts the workers that some rows of a group need, and compares losses with those of their twins.
+
+    Returns:
+        {name: worker}, and {name: the largest relative difference of a loss}, for those that have a twin.
+    """
+    workers, checks, checked = {}, {}, {}
+    for name, program in group.needed(rows).items():
+        worker = Worker(program.side, program.arguments, python if program.is_other else None)
+        workers[name] = stack.enter_context(worker)
+        worker.ask("build")
+        if twin := program.twin:
+            if twin not in checked:
+                checked[twin] = workers[twin].ask("check", updates=CHECK_UPDATES)
+            losses, given = checked[twin]
+            checks[name] = difference(losses, worker.ask("check", updates=CHECK_UPDATES, **given))
+        display.say(f"bench: {name} is ready")
+    return workers, checks
+
+
+def measure(
+    group: Group, rows: Sequence[str], *, rounds: int, python: str, quick: bool = False
+) -> tuple[dict[str, list[list[float]]], dict[str, float]]:
     """Measures some rows of a group.
 
     Args:
@@ -149,70 +159,35 @@ def measure(group: Group, rows: Sequence[str], rounds: int, python: str, quick: 
         python: the interpreter of the other sides.
         quick: turns are a twelfth as long.
 
+    Returns:
+        {series: the repetitions of each round}, and what `start` found.
+
     Raises:
         WorkerError: a worker failed.
         CheckFailed: the sides compute different losses.
     """
-    results = Results({}, {})
-    programs = group.needed(rows)
-    start = time.monotonic()
+    replies: dict[str, list[list[float]]] = {}
+    rounds = min(rounds, group.rounds)
     with contextlib.ExitStack() as stack:
-        workers: dict[str, Worker] = {}
-        twins: dict[str, Any] = {}
-        for name, program in programs.items():
-            interpreter, env = (
-                (python, {}) if program.is_other else (sys.executable, {"JAX_PLATFORMS": "cpu"})
-            )
-            worker = Worker(interpreter, program.side, program.arguments, env)
-            workers[name] = stack.enter_context(worker)
-            worker.ask("build")
-            if program.twin:
-                if program.twin not in twins:
-                    twins[program.twin] = workers[program.twin].ask("check", updates=CHECK_UPDATES)
-                ours = dict(twins[program.twin])
-                losses = ours.pop("losses")
-                results.checks[name] = difference(losses, worker.ask("check", updates=CHECK_UPDATES, **ours))
-            display.say(f"bench: {name}: ready after {time.monotonic() - start:.0f} s")
-        for number in range(rounds):
-            for name, program in programs.items():
-                turn = {what: -(-count // 12) if quick else count for what, count in program.turn.items()}
-                for series, found in workers[name].ask("turn", **turn).items():
-                    results.replies.setdefault(f"{name}.{series}", []).append(found)
-            spent = time.monotonic() - start
-            display.say(f"bench: {', '.join(rows)}: round {number + 1} of {rounds} after {spent:.0f} s")
-    return results
+        workers, checks = start(group, rows, python, stack)
+        begun = time.monotonic()
+        for number in range(1, rounds + 1):
+            for name, worker in workers.items():
+                turn = group.programs[name].turn
+                turn = {what: math.ceil(count / 12) for what, count in turn.items()} if quick else turn
+                for series, found in worker.ask("turn", **turn).items():
+                    replies.setdefault(f"{name}.{series}", []).append(found)
+            left = (rounds / number - 1) * (time.monotonic() - begun)
+            display.say(f"bench: {', '.join(rows)}: round {number} of {rounds}, {left:.0f} s left")
+    return replies, checks
 
 
-def markdown(rows: Sequence[Sequence[str]]) -> str:
+def table(lines: Sequence[Sequence[str]]) -> str:
     """A Markdown table with columns that line up in a terminal too; ends with a newline."""
-    widths = [max(len(row[i]) for row in (HEAD, *rows)) for i in range(len(HEAD))]
-    rule = ["-" * width for width in widths]
-    padded = (map(str.ljust, row, widths) for row in (HEAD, rule, *rows))
-    return "".join(f"| {' | '.join(row)} |\n" for row in padded)
-
-
-def report(rows: Sequence[str], results: Results, about: Mapping[str, Any]) -> tuple[str, dict[str, Any]]:
-    """The table with what stands around it, and what bench.json holds; rows without replies were skipped."""
-    lines, records = [], {}
-    for name in rows:
-        row = ROWS[name]
-        replies = {series: results.replies.get(series) for series in (row.ours, *row.theirs.values())}
-        found = row.figures(replies) if all(replies.values()) else None
-        lines.append(row.cells(found))
-        records[name] = {"title": row.title, "unit": row.unit, "goal": row.goal, "skipped": not found}
-        if found:
-            as_json = {key: x._asdict() if isinstance(x, tuple) else x for key, x in found.items()}
-            records[name] |= {"figures": as_json, "rounds": replies}
-    text = markdown(lines)
-    text += f"\nMedians of {about['rounds']} rounds, in brackets their quartiles, on {about['cores']} cores "
-    text += f"of {about['cpu']}.\n"
-    if about["load"] > BUSY:
-        text += f"Other programs were running: load average {about['load']:.1f} at the start.\n"
-    if results.checks:
-        shown = ", ".join(f"{name} {value:.0e}" for name, value in results.checks.items())
-        text += f"Check passed: from equal weights, without noise, the losses of {CHECK_UPDATES} updates are "
-        text += f"PyTorch's. Largest relative difference ({TOLERANCE:.0e} allowed): {shown}.\n"
-    return text, {**about, "checks": results.checks, "rows": records}
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    head, *rest = (" | ".join(map(str.ljust, line, widths)) for line in lines)
+    rule = " | ".join("-" * width for width in widths)
+    return "".join(f"| {line} |\n" for line in (head, rule, *rest))
 
 
 def bench(values: flags.FlagValues) -> None:
@@ -225,38 +200,56 @@ def bench(values: flags.FlagValues) -> None:
     rows = chosen_rows(values["only"].value)
     path = check_out(values["out"].value)
     quick = values["quick"].value
+    rounds = 1 if quick else values["rounds"].value
     python = str(ROOT / Path(values["bench_python"].value).expanduser())
-    others = other_versions(python)
+    others, load = other_versions(python), os.getloadavg()[0]
     about = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "cpu": cpu_model(),
         "cores": runtime.cores(),
-        "load": os.getloadavg()[0],
+        "load": load,
         "git_revision": git_revision(),
         "versions": versions(),
         "other_versions": others,
-        "rounds": 1 if quick else values["rounds"].value,
+        "rounds": rounds,
     }
-    if about["load"] > BUSY:
-        display.say(f"load average {about['load']:.1f}: other programs distort what is measured")
-    results = Results({}, {})
+    busy = f"other programs were running: load average {load:.1f} at the start" if load > BUSY else ""
+    if busy:
+        display.say(busy)
+    lines, records, checks = [HEAD], {}, {}
     for group in GROUPS:
         chosen = [name for name in rows if name in group.rows]
-        needing = [
-            name for name in chosen if any(program.is_other for program in group.needed([name]).values())
-        ]
-        lacking = [] if others else needing
-        if lacking:
-            why = "for want of PyTorch and Tianshou; `make bench-install` installs them"
-            display.say(f"skipped: {', '.join(lacking)}, {why}")
-        if measured := [name for name in chosen if name not in lacking]:
-            found = measure(group, measured, min(about["rounds"], group.rounds), python, quick)
-            results.replies.update(found.replies)
-            results.checks.update(found.checks)
-    text, record = report(rows, results, about)
+        needing = {name for name in chosen if any(p.is_other for p in group.needed([name]).values())}
+        measured = [name for name in chosen if others or name not in needing]
+        if measured:
+            replies, found = measure(group, measured, rounds=rounds, python=python, quick=quick)
+            checks |= found
+        for name in chosen:
+            row = group.rows[name]
+            records[name] = {"title": row.title, "unit": row.unit, "goal": row.goal}
+            if name in measured:
+                figures = row.figures(replies)
+                lines.append(row.cells(figures))
+                records[name] |= {"figures": figures, "rounds": {one: replies[one] for one in row.series}}
+            else:
+                display.say(
+                    f"skipped for want of PyTorch and Tianshou: {name}; `make bench-install` installs them"
+                )
+                lines.append([row.title, "skipped", "not installed", "-", row.goal])
+                records[name]["skipped"] = True
+    text = table(lines)
+    text += f"\nMedians of {rounds} rounds, in brackets their quartiles, on {about['cores']} cores "
+    text += f"of {about['cpu']}.\n"
+    if busy:
+        text += f"{busy.capitalize()}.\n"
+    if checks:
+        shown = ", ".join(f"{name} {value:.0e}" for name, value in checks.items())
+        text += f"Check passed: from equal weights, without noise, the losses of {CHECK_UPDATES} updates are "
+        text += f"PyTorch's. Largest relative difference ({TOLERANCE:.0e} allowed): {shown}.\n"
     print(text, end="")
     if path is not None:
         path.mkdir(parents=True, exist_ok=True)
+        record = {**about, "checks": checks, "rows": records}
         (path / "bench.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         (path / "bench.md").write_text(text, encoding="utf-8")
 

@@ -75,10 +75,10 @@ def measure(values: flags.FlagValues) -> dict[str, Any]:
         side = Updates(preset, seeds)
         side.turn(WARM_UPDATES)
         found = spread(side.turn(values["updates"].value)["update"])
-        quartiles = [found.low, found.high]
-        figures[name] = {"median": found.median, "quartiles": quartiles, "goal": goal, "unit": "ms"}
+        quartiles = [found["low"], found["high"]]
+        figures[name] = {"median": found["median"], "quartiles": quartiles, "goal": goal, "unit": "ms"}
         print(f"{name}: {spread_text(found, 'ms')}, goal {number(goal)}", flush=True)
-        return found.median
+        return found["median"]
 
     one = update("update rl_only nature", NATURE, 0.5)
     update("update joint 256", JOINT, 1.0)

@@ -1,4 +1,4 @@
-"""This project's loop and its replay; two `worker` sides. Imports jax when one is built."""
+"""This project's loop and its replay; two sides of `worker`."""
 
 import time
 from collections.abc import Callable
@@ -7,8 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from .jax_side import NUM_ACTIONS, config_of, frame_shape, prepare
-from .worker import serve
+from srl_jax import envs, loop, replay
+from srl_jax.agent import make_agent
+
+from .jax_side import NUM_ACTIONS, config_of, frame_shape
 
 WARM_UPDATES = 5
 """Updates of the loop before anything is timed."""
@@ -27,8 +29,6 @@ class Loop:
     """A run of a preset, without evaluation and files, past its first updates."""
 
     def __init__(self, preset: str):
-        from srl_jax import loop
-
         self._run = loop.Run([config_of(preset)], [Path()])
         self._run.begin()
         while self._run.updates < WARM_UPDATES:
@@ -43,10 +43,10 @@ class Loop:
             iterations: steps of all environments with the updates that are due, and as many of either half.
 
         Returns:
-            "env_steps_per_s" of the first, which end with what a row of metrics.jsonl waits for; milliseconds
-            of each "iteration", and "busy", processor time to wall-clock time meanwhile. "slower half" is the
-            greater of two medians: acting and stepping the environments while nothing is updated, and the
-            updates of an iteration, from sampling to setting priorities, while no environment moves.
+            "rate" of the first, env steps a second, to the end of what a row of metrics.jsonl waits for;
+            milliseconds of each "iteration", and "busy", processor time to wall-clock time meanwhile. The
+            "slower half" is the greater of two medians: acting and stepping the environments while nothing
+            is updated, and an iteration's updates, with sampling and priorities, while no environment moves.
         """
         run = self._run
         first, start = run.env_steps, time.perf_counter()
@@ -65,7 +65,7 @@ class Loop:
         self._forget()
         slower = max(float(np.median(half)) for half in (acting, updates))
         return {
-            "env_steps_per_s": [rate],
+            "rate": [rate],
             "iteration": iteration,
             "busy": [busy],
             "slower half": [slower],
@@ -92,9 +92,6 @@ class Replay:
     """A preset's buffer, full of noise in episodes of about 800 env steps, and its environments."""
 
     def __init__(self, preset: str):
-        from srl_jax import envs, replay
-        from srl_jax.agent import make_agent
-
         config = config_of(preset)
         shape, streams = frame_shape(config), config.num_envs
         self._rng = rng = np.random.default_rng(0)
@@ -156,8 +153,3 @@ class Replay:
     def _sample(self, errors: np.ndarray) -> None:
         _, indices = self._replay.sample(self._batch, BETA)
         self._replay.set_priorities(indices, errors)
-
-
-if __name__ == "__main__":
-    prepare()
-    serve(Loop, Replay)

@@ -1,21 +1,21 @@
-"""This project's updates: timed, and checked; a `worker`, and what other benchmarks share.
-
-Imports jax when an update is built.
-"""
+"""This project's updates: timed, and checked; a side of `worker`, and what other benchmarks share."""
 
 import dataclasses
 import time
 from typing import Any
 from unittest import mock
 
+import jax
 import numpy as np
+from flax.traverse_util import flatten_dict
 
+from srl_jax import encoders, objectives, rl
+from srl_jax.agent import make_agent, over_seeds
 from srl_jax.config import Config, resolve
-from srl_jax.types import TrainState, Window
+from srl_jax.rl import heads
+from srl_jax.types import Window
 
-from .. import runtime
 from ..presets import PRESETS
-from .worker import arguments, serve
 
 NUM_ACTIONS = 6
 """Pong's."""
@@ -34,9 +34,7 @@ JITTER = 0.003
 
 
 def config_of(preset: str, **overrides: Any) -> Config:
-    """The resolved settings of a preset; imports jax."""
-    from srl_jax import encoders, objectives, rl
-
+    """The resolved settings of a preset."""
     config = Config(**{**PRESETS[preset], **overrides})
     return resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
 
@@ -65,14 +63,6 @@ def random_window(config: Config, horizon: int, seed: int) -> Window:
     )
 
 
-def flat(tree: Any) -> dict[str, np.ndarray]:
-    """A tree of dicts as {path/with/slashes: array}."""
-    import jax
-
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {"/".join(str(k.key) for k in path): np.array(leaf) for path, leaf in leaves}
-
-
 class Updates:
     """A preset's jitted update and the state that it moves, compiled and warmed up.
 
@@ -88,10 +78,6 @@ class Updates:
     """
 
     def __init__(self, preset: str, seeds: int = 1, **overrides: Any):
-        import jax
-
-        from srl_jax.agent import make_agent, over_seeds
-
         self.config = config_of(preset, **overrides)
         self.agent = make_agent(self.config, frame_shape(self.config), NUM_ACTIONS)
         self.device = over_seeds(self.agent, seeds)
@@ -101,34 +87,33 @@ class Updates:
         self._seeds, self._count = seeds, 0
         self.turn(WARM_UPDATES)
 
-    def check(self, updates: int) -> dict[str, Any]:
-        """What another side must reproduce.
+    def check(self, updates: int) -> tuple[list[dict[str, float]], dict[str, Any]]:
+        """What another side must reproduce, without noise and on one batch.
 
         Args:
-            updates: how many, without noise and on one batch.
+            updates: how many.
 
         Returns:
-            "losses" of each, {name: the mean before its weight}, "total" the weighted sum. What they start
-            from: "params", `TrainState.params` and `.slow` by path, with biases and a slow copy unlike those
-            of a start; "window".
+            The losses of each, {name: the mean before its weight}, "total" the weighted sum. And what they
+            start from: "params", `TrainState.params` and `.slow` by path, with biases and a slow copy unlike
+            those of a start; "window".
         """
-        import jax
-
-        from srl_jax.agent import make_agent
-        from srl_jax.rl import heads
-
         state = self.agent.init(jax.random.key(self.config.seed), None)
         state = state._replace(params=_jittered(state.params, 1), slow=_jittered(state.slow, 2))
-        found = {"params": flat({"params": state.params, "slow": state.slow}), "losses": []}
+        given = {
+            "params": flatten_dict(jax.device_get({"params": state.params, "slow": state.slow}), sep="/"),
+            "window": self.windows[0]._asdict(),
+        }
         # Not the timed update: what is traced here has no noise in it.
         config = dataclasses.replace(self.config, adam_eps=CHECK_ADAM_EPS)
         agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
+        found = []
         with mock.patch.object(heads, "factorised_noise", lambda key, size: np.zeros(size, np.float32)):
             for _ in range(updates):
                 state, _, metrics = agent.update(state, self.windows[0], agent.hyper)
-                losses = {n.removeprefix("loss/"): x for n, x in metrics.items() if n.startswith("loss/")}
-                found["losses"].append({name: float(value) for name, value in losses.items()})
-        return found | {"window": self.windows[0]._asdict()}
+                names = [name for name in metrics if name.startswith("loss/")]
+                found.append({name.removeprefix("loss/"): float(metrics[name]) for name in names})
+        return found, given
 
     def turn(self, updates: int) -> dict[str, list[float]]:
         """Goes on with so many updates.
@@ -141,8 +126,6 @@ class Updates:
         return {"update": [1e3 * sum(self._update() for _ in range(every)) / every for _ in range(updates)]}
 
     def _update(self) -> float:
-        import jax
-
         update = self.device.update_rl if self._count % self.config.srl_every else self.device.update
         windows = [self.windows[(self._count + i) % WINDOWS] for i in range(self._seeds)]
         self._count += 1
@@ -153,23 +136,8 @@ class Updates:
         return time.perf_counter() - start
 
 
-def _jittered(tree: TrainState, seed: int) -> Any:
+def _jittered(tree: Any, seed: int) -> Any:
     """The tree with a little noise on every number."""
-    import jax
-
     rng = np.random.default_rng(seed)
 
-    def moved(leaf):
-        return jax.numpy.asarray(leaf + rng.normal(0, JITTER, leaf.shape).astype(np.float32))
-
-    return jax.tree.map(moved, tree)
-
-
-def prepare() -> None:
-    """Gives a worker the environment that a run of its preset gives itself."""
-    runtime.prepare("auto", PRESETS[arguments()["preset"]]["encoder"])
-
-
-if __name__ == "__main__":
-    prepare()
-    serve(Updates)
+    return jax.tree.map(lambda x: x + rng.normal(0, JITTER, x.shape).astype(np.float32), tree)

@@ -23,7 +23,7 @@ PASSES = 7
 
 
 def best(function: Callable, *arguments: np.ndarray) -> float:
-    """The least of the milliseconds that a jitted function takes."""
+    """The least milliseconds that a jitted function takes."""
     import jax
 
     jitted, arguments = jax.jit(function), jax.device_put(arguments)
@@ -43,26 +43,27 @@ def main() -> None:
     draw = np.random.default_rng(0).standard_normal
     a, b, big = draw((512, 3136), np.float32), draw((3136, 1024), np.float32), draw(30_000_000, np.float32)
     x, kernel = draw((32, 41, 41, 32), np.float32), draw((3, 3, 32, 32), np.float32)
-    product = 2e-6 * 512 * 3136 * 1024 / best(lambda a, b: a @ b, a, b)
-    convolution = 2e-6 * 32 * 39**2 * 9 * 32**2 / best(convolve, x, kernel)
-    memory = 2e-6 * big.nbytes / best(lambda x: 2 * x, big)
-    print(
-        f"best rates: product {product:.0f} GFLOP/s, convolution {convolution:.0f} GFLOP/s, memory {memory:.1f} GB/s"
-    )
+    rates = {
+        "product": 2e-6 * 512 * 3136 * 1024 / best(lambda a, b: a @ b, a, b),
+        "convolution": 2e-6 * 32 * 39**2 * 9 * 32**2 / best(convolve, x, kernel),
+        "memory": 2e-6 * big.nbytes / best(lambda x: 2 * x, big),
+    }
+    print("best rates, GFLOP/s and GB/s:", ", ".join(f"{name} {rate:.0f}" for name, rate in rates.items()))
     for preset, form in PRESETS:
         side = Updates(preset, encoder_optimizer=form)
         update = jax.jit(side.agent.update.pure).lower(side.state, side.windows[0], side.agent.hyper)
         gflop = update.cost_analysis()["flops"] / 1e9
         # An Adam's two moments are as large as what it moves.
-        moments, slow = (
+        opt_state, slow = (
             sum(x.nbytes for x in jax.tree.leaves(tree)) for tree in (side.state.opt_state, side.state.slow)
         )
-        megabytes = (PASSES * moments / 2 + slow) / 1e6
-        products, passes = 1e3 * gflop / max(product, convolution), megabytes / memory
+        megabytes = (PASSES * opt_state / 2 + slow) / 1e6
+        products = 1e3 * gflop / max(rates["product"], rates["convolution"])
+        passes = megabytes / rates["memory"]
         found = side.turn(UPDATES)["update"]
         print(
-            f"{preset}, {form}: {gflop:.1f} GFLOP {products:.0f} ms + {megabytes:.0f} MB {passes:.0f} ms = floor "
-            f"{products + passes:.0f} ms; update {np.median(found):.0f} ms (best {min(found):.0f})"
+            f"{preset}, {form}: {gflop:.1f} GFLOP {products:.0f} ms + {megabytes:.0f} MB {passes:.0f} ms = "
+            f"floor {products + passes:.0f} ms; update {np.median(found):.0f} ms (best {min(found):.0f})"
         )
 
 

@@ -1,4 +1,4 @@
-"""Training with Tianshou's Rainbow and the thesis' settings; a `worker`.
+"""Training with Tianshou's Rainbow and the settings of `thesis/rl_only_nature`; a side of `worker`.
 
 The loop is that of Tianshou's off-policy trainer, less its logging: collect one env step of all environments,
 then update once. Tianshou collects with the noisy layers' means, so only epsilon-greedy explores. It starts
@@ -26,32 +26,19 @@ from tianshou.env.atari.atari_network import RainbowNet
 from tianshou.env.atari.atari_wrapper import wrap_deepmind
 from tianshou.utils.torch_utils import policy_within_training_step
 
-from .worker import serve
-
-GAME, NUM_ENVS, SEED = "Pong", 10, 0
-STACK = 4  # frames
-MAX_FRAMES = 108_000  # of an episode
-ATOMS, V_MIN, V_MAX = 51, -10.0, 10.0
-NOISY_STD = 0.1
-GAMMA, N_STEP = 0.99, 3
-LEARNING_RATE, ADAM_EPS = 1e-4, 1e-8
-SLOW_UPDATE_EVERY = 500  # updates
-BUFFER_SIZE = 100_000  # transitions
-ALPHA, BETA = 0.5, 0.4
-BATCH_SIZE = 32
-LEARN_START = 320  # env steps
+NUM_ENVS, SEED, STACK, BATCH_SIZE = 10, 0, 4, 32
 EPS_START, EPS_FINAL, EPS_ANNEAL_STEPS = 1.0, 0.05, 1_000_000
-WARM_STEPS = 50  # env steps with updates
+LEARN_START, WARM_STEPS = 320, 50  # env steps without updates, and with
 
 
 def make_env() -> gym.Env:
-    """The game below Tianshou's own Atari wrappers, as in its examples: uint8 [4, 84, 84], newest last."""
+    """Pong below Tianshou's own Atari wrappers, as in its examples: uint8 [4, 84, 84], newest last."""
     gym.register_envs(ale_py)
     env = gym.make(
-        f"ALE/{GAME}-v5",
+        "ALE/Pong-v5",
         frameskip=1,  # the wrappers skip
         repeat_action_probability=0.0,
-        max_num_frames_per_episode=MAX_FRAMES,
+        max_num_frames_per_episode=108_000,
     )
     return wrap_deepmind(env, episode_life=True, clip_rewards=True, frame_stack=STACK)
 
@@ -70,38 +57,41 @@ class Loop:
         envs = DummyVectorEnv([make_env] * NUM_ENVS)
         envs.seed(SEED)
         space = envs.action_space[0]
-        network = RainbowNet(c=STACK, h=84, w=84, action_shape=space.n, num_atoms=ATOMS, noisy_std=NOISY_STD)
         self._policy = C51Policy(
-            model=network,
+            model=RainbowNet(c=STACK, h=84, w=84, action_shape=space.n, num_atoms=51, noisy_std=0.1),
             action_space=space,
-            num_atoms=ATOMS,
-            v_min=V_MIN,
-            v_max=V_MAX,
+            num_atoms=51,
+            v_min=-10.0,
+            v_max=10.0,
             eps_training=EPS_START,
         )
         self._algorithm = RainbowDQN(
             policy=self._policy,
-            optim=AdamOptimizerFactory(lr=LEARNING_RATE, eps=ADAM_EPS),
-            gamma=GAMMA,
-            n_step_return_horizon=N_STEP,
-            target_update_freq=SLOW_UPDATE_EVERY,
+            optim=AdamOptimizerFactory(lr=1e-4, eps=1e-8),
+            gamma=0.99,
+            n_step_return_horizon=3,
+            target_update_freq=500,
         )
         self._buffer = PrioritizedVectorReplayBuffer(
-            BUFFER_SIZE,
+            100_000,
             buffer_num=NUM_ENVS,
             ignore_obs_next=True,
             save_only_last_obs=True,
             stack_num=STACK,
-            alpha=ALPHA,
-            beta=BETA,
+            alpha=0.5,
+            beta=0.4,
         )
         self._collector = Collector(self._algorithm, envs, self._buffer, exploration_noise=True)
         self._collector.reset()
-        self._collector.collect(n_step=math.ceil(LEARN_START / NUM_ENVS) * NUM_ENVS, random=True)
+        self._collector.collect(n_step=LEARN_START, random=True)
         self.turn(WARM_STEPS)
 
     def turn(self, env_steps: int) -> dict[str, list[float]]:
-        """Goes on for so long, rounded up to whole steps of all environments. Returns "env_steps_per_s"."""
+        """Goes on for so long, rounded up to whole steps of all environments.
+
+        Returns:
+            "rate", env steps a second.
+        """
         steps = math.ceil(env_steps / NUM_ENVS)
         start = time.perf_counter()
         for _ in range(steps):
@@ -110,8 +100,4 @@ class Loop:
             with policy_within_training_step(self._policy):
                 self._collector.collect(n_step=NUM_ENVS)
                 self._algorithm.update(self._buffer, BATCH_SIZE)
-        return {"env_steps_per_s": [steps * NUM_ENVS / (time.perf_counter() - start)]}
-
-
-if __name__ == "__main__":
-    serve(Loop)
+        return {"rate": [steps * NUM_ENVS / (time.perf_counter() - start)]}

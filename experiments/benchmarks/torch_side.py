@@ -1,4 +1,4 @@
-"""The update of three arms of the thesis in PyTorch, eager, on its own functions and optimizers; a `worker`.
+"""The update of three arms of the thesis in PyTorch, eager; a side of `worker`.
 
 Parameters and batch come from srl_jax, and without noise the losses are srl_jax's, so that what is timed is
 the same mathematics. It imports nothing of srl_jax: what the two sides share, they state twice.
@@ -12,8 +12,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
-
-from .worker import serve
 
 STRIDES = {
     "thesis/rl_only_nature": (4, 2, 1),
@@ -280,7 +278,3 @@ class Updates:
             self._learner.update()
             found.append(1e3 * (time.perf_counter() - start))
         return {"update": found}
-
-
-if __name__ == "__main__":
-    serve(Updates)

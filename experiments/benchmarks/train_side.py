@@ -1,4 +1,4 @@
-"""Whole runs of experiments.train, for their start and their memory; two `worker` sides.
+"""Whole runs of experiments.train, for their start and their memory; two sides of `worker`.
 
 `python -m experiments.benchmarks.train_side`, with train's flags, ends after its first update.
 """
@@ -9,63 +9,55 @@ import subprocess
 import sys
 import tempfile
 import time
-from typing import NoReturn
 
 from .. import flags as config_flags
 from .. import runtime, train
-from .worker import ROOT, serve
+from .worker import ROOT
 
 
-class Run:
-    """Runs of a preset, one a turn.
+def run(module: str, **flags: object) -> tuple[float, float]:
+    """Runs a module to its end, with a run directory that is deleted afterwards.
 
-    Args:
-        preset: a key of `experiments.presets.PRESETS`.
+    Returns:
+        Seconds, and the largest resident size in GB.
+
+    Raises:
+        ChildProcessError: its exit status was not 0.
     """
+    with tempfile.TemporaryDirectory() as folder, open(f"{folder}/log", "w+", encoding="utf-8") as log:
+        given = [f"--{name}={value}" for name, value in flags.items()]
+        command = [sys.executable, "-m", module, *given, f"--out={folder}/run"]
+        start = time.perf_counter()
+        process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
+        _, status, usage = os.wait4(process.pid, 0)
+        seconds = time.perf_counter() - start
+        process.returncode = os.waitstatus_to_exitcode(status)
+        log.seek(0)
+        if process.returncode:
+            raise ChildProcessError(f"{module}: {log.read().strip().splitlines()[-1:]}")
+    return seconds, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+
+
+class Startup:
+    """Starts of a preset. The first one fills jax' cache."""
 
     def __init__(self, preset: str):
         self._preset = preset
-
-    def run(self, module: str, **flags: object) -> tuple[float, int]:
-        """Runs a module to its end, with a run directory that is deleted afterwards.
-
-        Returns:
-            Seconds, and the largest resident size in GB.
-
-        Raises:
-            ChildProcessError: its exit status was not 0.
-        """
-        with tempfile.TemporaryDirectory() as folder, open(f"{folder}/log", "w+", encoding="utf-8") as log:
-            flags = {"preset": self._preset, "out": f"{folder}/run", **flags}
-            command = [sys.executable, "-m", module, *(f"--{name}={value}" for name, value in flags.items())]
-            start = time.perf_counter()
-            process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-            _, status, usage = os.wait4(process.pid, 0)
-            seconds = time.perf_counter() - start
-            process.returncode = os.waitstatus_to_exitcode(status)
-            log.seek(0)
-            if process.returncode:
-                raise ChildProcessError(f"{module}: {log.read().strip().splitlines()[-1:]}")
-        return seconds, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
-
-
-class Startup(Run):
-    """The first start fills jax' cache."""
-
-    def __init__(self, preset: str):
-        super().__init__(preset)
         self.turn()
 
     def turn(self) -> dict[str, list[float]]:
         """Starts once. Returns "startup", the seconds until the first update has ended."""
-        return {"startup": [self.run(__spec__.name)[0]]}
+        return {"startup": [run(__name__, preset=self._preset)[0]]}
 
 
-class Memory(Run):
-    """See `turn`."""
+class Memory:
+    """A run of a preset, with fewer updates than usual, so that it takes two minutes."""
+
+    def __init__(self, preset: str):
+        self._flags = {"preset": preset, "updates_per_step": 0.005, "eval_games": 2}
 
     def turn(self, buffer_size: int) -> dict[str, list[float]]:
-        """Trains until the buffer is full, with fewer updates than usual, so that it takes two minutes.
+        """Trains until the buffer is full.
 
         Args:
             buffer_size: in transitions of 84 x 84 bytes.
@@ -73,8 +65,8 @@ class Memory(Run):
         Returns:
             "memory", the largest resident size in GB; "frames", what the frames of a full buffer take alone.
         """
-        few = {"steps": int(1.05 * buffer_size), "updates_per_step": 0.005, "eval_games": 2}
-        _, memory = self.run("experiments.train", buffer_size=buffer_size, **few)
+        steps = int(1.05 * buffer_size)
+        _, memory = run("experiments.train", steps=steps, buffer_size=buffer_size, **self._flags)
         return {"memory": [memory], "frames": [buffer_size * 84 * 84 / 1e9]}
 
 
@@ -85,7 +77,7 @@ def prepare(tune: str, encoder: str) -> None:
 
     update = Run.update
 
-    def once(self) -> NoReturn:
+    def once(self) -> None:
         update(self)
         os._exit(0)
 
@@ -93,8 +85,5 @@ def prepare(tune: str, encoder: str) -> None:
 
 
 if __name__ == "__main__":
-    if sys.argv[1] in ("Startup", "Memory"):
-        serve(Startup, Memory)
-    else:
-        train.define_flags()
-        config_flags.run(functools.partial(train.main, prepare=prepare))
+    train.define_flags()
+    config_flags.run(functools.partial(train.main, prepare=prepare))

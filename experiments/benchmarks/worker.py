@@ -1,10 +1,11 @@
 """A side of the comparison in a process of its own, and what it is asked.
 
-A side is a class: `side(**arguments)` builds it and warms it up, its methods take and give plain values and
-numpy arrays. Requests and replies are pickles in the worker's standard input and output. Standard library
-only: either end may run where the other's packages are missing.
+A side is a class of one of the modules `*_side`: `Side(**arguments)` builds it and warms it up, its methods
+take and give plain values and numpy arrays. Requests and replies are pickles in the worker's standard input
+and output. Standard library only: either end may run where the other's packages are missing.
 """
 
+import importlib
 import json
 import os
 import pickle
@@ -18,31 +19,33 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 """The repository's root, where workers start."""
 
+TUNED = ("jax_side", "host_side")
+"""Modules that run in the environment that a run of their preset gives itself."""
+
 
 class WorkerError(RuntimeError):
     """A worker that failed; one line."""
 
 
 class Worker:
-    """A process that runs `serve`; a context manager, which ends it.
+    """A process that answers; a context manager, which ends it.
 
     Args:
-        python: its interpreter.
         side: MODULE.CLASS of this package.
         arguments: the class'; what JSON can hold.
-        env: variables added to this process' own.
+        python: another interpreter; None for this one, where jax is to compute on the CPU.
 
     Raises:
         WorkerError: the interpreter cannot be started.
     """
 
-    def __init__(self, python: str, side: str, arguments: Mapping[str, Any], env: Mapping[str, str]):
+    def __init__(self, side: str, arguments: Mapping[str, Any], python: str | None = None):
         self._side = side
-        module, name = side.split(".")
-        command = [python, "-m", f"{__package__}.{module}", name, json.dumps(arguments)]
+        command = [python or sys.executable, "-m", __name__, side, json.dumps(arguments)]
+        env = os.environ if python else {**os.environ, "JAX_PLATFORMS": "cpu"}
         pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
         try:
-            self._process = subprocess.Popen(command, cwd=ROOT, env={**os.environ, **env}, **pipes)
+            self._process = subprocess.Popen(command, cwd=ROOT, env=env, **pipes)
         except OSError as error:
             raise WorkerError(f"{python}: {error.strerror}") from None
 
@@ -69,19 +72,24 @@ class Worker:
         self._process.communicate()
 
 
-def arguments() -> dict[str, Any]:
-    """The side's arguments, in a worker."""
-    return json.loads(sys.argv[2])
+def build(side: str, arguments: Mapping[str, Any]) -> Any:
+    """Imports a side's module and builds it."""
+    module, name = side.split(".")
+    return getattr(importlib.import_module(f"{__package__}.{module}"), name)(**arguments)
 
 
-def serve(*sides: type) -> None:
-    """Builds the side that the command line names when asked to "build", and answers until nobody asks.
+def main(side: str, arguments: Mapping[str, Any]) -> None:
+    """Answers requests until nobody asks any more.
 
     What is printed meanwhile goes to standard error. An exception becomes the reply, as "Type: message".
     """
+    if side.split(".")[0] in TUNED:
+        from .. import presets, runtime
+
+        runtime.prepare("auto", presets.PRESETS[arguments["preset"]]["encoder"])
+    built = None
     with os.fdopen(os.dup(1), "wb") as replies:
         os.dup2(2, 1)
-        side = None
         while True:
             try:
                 method, values = pickle.load(sys.stdin.buffer)
@@ -89,10 +97,14 @@ def serve(*sides: type) -> None:
                 return
             try:
                 if method == "build":
-                    side = next(one for one in sides if one.__name__ == sys.argv[1])(**arguments())
-                reply = None if method == "build" else getattr(side, method)(**values), None
+                    built = build(side, arguments)
+                reply = None if method == "build" else getattr(built, method)(**values), None
             except Exception as error:
                 traceback.print_exc()
                 reply = None, f"{type(error).__name__}: {' '.join(str(error).split())}"
             pickle.dump(reply, replies)
             replies.flush()
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], json.loads(sys.argv[2]))
