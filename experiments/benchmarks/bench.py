@@ -135,9 +135,10 @@ def start(group: Group, rows: Sequence[str], python: str, stack: contextlib.Exit
     """
     workers, checks, checked = {}, {}, {}
     for name, program in group.needed(rows).items():
-        worker = Worker(program.side, program.arguments, python if program.is_other else None)
-        workers[name] = stack.enter_context(worker)
+        interpreter = python if program.is_other else None
+        worker = stack.enter_context(Worker(program.side, program.arguments, interpreter))
         worker.ask("build")
+        workers[name] = worker
         if twin := program.twin:
             if twin not in checked:
                 checked[twin] = workers[twin].ask("check", updates=CHECK_UPDATES)

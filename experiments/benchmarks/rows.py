@@ -16,7 +16,7 @@ class Program(NamedTuple):
     """A worker.
 
     Attributes:
-        side: MODULE.CLASS of this package.
+        side: MODULE.CLASS.
         arguments: the class'.
         turn: how much is done in a turn, {what is counted: number}.
         twin: this project's worker whose weights it loads, and whose losses its own must equal; "" for none.
@@ -30,7 +30,7 @@ class Program(NamedTuple):
     @property
     def is_other(self) -> bool:
         """Whether it runs in the environment of `make bench-install`."""
-        return self.side.split(".")[0] in ("torch_side", "tianshou_side")
+        return self.side.rpartition(".")[0] in (".torch_side", ".tianshou_side")
 
 
 class Row(NamedTuple):
@@ -129,7 +129,7 @@ FORMATS = {"PyTorch contiguous": "contiguous_format", "PyTorch channels last": "
 
 def _ours(preset: str, updates: int, **overrides: Any) -> Program:
     """An update in this project."""
-    return Program("jax_side.Updates", {"preset": preset, **overrides}, {"updates": updates})
+    return Program(".jax_side.Updates", {"preset": preset, **overrides}, {"updates": updates})
 
 
 def _both(name: str, preset: str, updates: int, **overrides: Any) -> dict[str, Program]:
@@ -137,7 +137,7 @@ def _both(name: str, preset: str, updates: int, **overrides: Any) -> dict[str, P
     found = {name: _ours(preset, updates, **overrides)}
     for label, memory_format in FORMATS.items():
         arguments = {"preset": preset, "threads": THREADS, "memory_format": memory_format, **overrides}
-        found[f"{name} {label}"] = Program("torch_side.Updates", arguments, {"updates": updates}, twin=name)
+        found[f"{name} {label}"] = Program(".torch_side.Updates", arguments, {"updates": updates}, twin=name)
     return found
 
 
@@ -180,8 +180,8 @@ _TIANSHOU = {"Tianshou": "tianshou.rate"}
 _HALF = {"acting or update alone": "loop.slower half"}
 LOOP = Group(
     {
-        "loop": Program("host_side.Loop", {"preset": NATURE}, {"env_steps": 300, "iterations": 30}),
-        "tianshou": Program("tianshou_side.Loop", {"threads": THREADS}, {"env_steps": 300}),
+        "loop": Program(".host_side.Loop", {"preset": NATURE}, {"env_steps": 300, "iterations": 30}),
+        "tianshou": Program(".tianshou_side.Loop", {"threads": THREADS}, {"env_steps": 300}),
     },
     {
         "loop": Row("loop Pong nature", "env steps/s", "loop.rate", _TIANSHOU, ">= 2.5"),
@@ -192,7 +192,7 @@ LOOP = Group(
 
 _GATHER, _STEP = {"numpy gather": "replay.gather"}, {"env step": "replay.env step"}
 REPLAY = Group(
-    {"replay": Program("host_side.Replay", {"preset": NATURE}, {"samples": 1000, "inserts": 200})},
+    {"replay": Program(".host_side.Replay", {"preset": NATURE}, {"samples": 1000, "inserts": 200})},
     {
         "replay_sample": Row(
             "replay sample + set priorities", "ms", "replay.sample", _GATHER, "<= 2, <= 0.3 ms"
@@ -202,14 +202,14 @@ REPLAY = Group(
 )
 
 STARTUP = Group(
-    {"run": Program("train_side.Startup", {"preset": JOINT})},
+    {"run": Program(".train_side.Startup", {"preset": JOINT})},
     {"startup": Row("start to first update, joint 256, warm cache", "s", "run.startup", goal="< 12 s")},
     rounds=3,
 )
 
 _FRAMES = {"the frames alone": "run.frames"}
 MEMORY = Group(
-    {"run": Program("train_side.Memory", {"preset": NATURE}, {"buffer_size": 100_000})},
+    {"run": Program(".train_side.Memory", {"preset": NATURE}, {"buffer_size": 100_000})},
     {"memory": Row("peak memory, buffer 100,000", "GB", "run.memory", _FRAMES, "<= 1.6 GB")},
     rounds=1,
 )

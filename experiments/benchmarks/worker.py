@@ -19,7 +19,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[2]
 """The repository's root, where workers start."""
 
-TUNED = ("jax_side", "host_side")
+TUNED = (".jax_side", ".host_side")
 """Modules that run in the environment that a run of their preset gives itself."""
 
 
@@ -31,7 +31,7 @@ class Worker:
     """A process that answers; a context manager, which ends it.
 
     Args:
-        side: MODULE.CLASS of this package.
+        side: MODULE.CLASS, `.jax_side.Updates`.
         arguments: the class'; what JSON can hold.
         python: another interpreter; None for this one, where jax is to compute on the CPU.
 
@@ -72,18 +72,13 @@ class Worker:
         self._process.communicate()
 
 
-def build(side: str, arguments: Mapping[str, Any]) -> Any:
-    """Imports a side's module and builds it."""
-    module, name = side.split(".")
-    return getattr(importlib.import_module(f"{__package__}.{module}"), name)(**arguments)
-
-
 def main(side: str, arguments: Mapping[str, Any]) -> None:
     """Answers requests until nobody asks any more.
 
     What is printed meanwhile goes to standard error. An exception becomes the reply, as "Type: message".
     """
-    if side.split(".")[0] in TUNED:
+    module, _, name = side.rpartition(".")
+    if module in TUNED:
         from .. import presets, runtime
 
         runtime.prepare("auto", presets.PRESETS[arguments["preset"]]["encoder"])
@@ -97,8 +92,10 @@ def main(side: str, arguments: Mapping[str, Any]) -> None:
                 return
             try:
                 if method == "build":
-                    built = build(side, arguments)
-                reply = None if method == "build" else getattr(built, method)(**values), None
+                    built = getattr(importlib.import_module(module, __package__), name)(**arguments)
+                    reply = None, None
+                else:
+                    reply = getattr(built, method)(**values), None
             except Exception as error:
                 traceback.print_exc()
                 reply = None, f"{type(error).__name__}: {' '.join(str(error).split())}"
