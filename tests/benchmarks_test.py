@@ -121,8 +121,10 @@ def asked(monkeypatch):
             names = ("update", "sample", "gather")
             return {name: [float(len(found.calls))] * values.get("updates", 1) for name in names}
 
-        yield types.SimpleNamespace(ask=ask)
-        found.calls.append((module, "end"))
+        try:
+            yield types.SimpleNamespace(ask=ask)
+        finally:
+            found.calls.append((module, "end"))
 
     monkeypatch.setattr(bench, "Worker", worker)
     return found
@@ -250,13 +252,13 @@ def test_rows_without_their_other_side_are_skipped_and_results_written(monkeypat
     bench.bench(_values("--only=replay_sample,update_256", "--quick", f"--out={tmp_path}/new"))
     assert {module for module, _ in asked.calls} == {"host_side"}
     out, err = capsys.readouterr()
-    assert "skipped for want of PyTorch and Tianshou: update_256; `make bench-install` installs" in err
+    assert "PyTorch and Tianshou are not there, `make bench-install` installs them" in err
     assert (tmp_path / "new" / "bench.md").read_text(encoding="utf-8") == out
     lines = [[cell.strip() for cell in line.split("|")[1:-1]] for line in out.splitlines()[:4]]
     assert lines[2] == ["update rl_only 256", "skipped", "not installed", "-", ">= 1.25"]
     assert lines[3][1:] == ["2.00 ms", "2.00 ms, numpy gather", "1.00", "<= 2, <= 0.3 ms"]
     record = json.loads((tmp_path / "new" / "bench.json").read_text(encoding="utf-8"))
-    assert record["rows"]["update_256"]["skipped"]
+    assert "figures" not in record["rows"]["update_256"]
     assert record["rows"]["replay_sample"]["rounds"] == {"replay.sample": [[2.0]], "replay.gather": [[2.0]]}
     assert {"date", "cpu", "cores", "load", "git_revision", "versions", "rounds"} <= record.keys()
 

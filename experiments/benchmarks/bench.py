@@ -19,6 +19,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from absl import flags
@@ -53,12 +54,10 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
     config_flags.define("rounds", Info(int, "how often each worker takes its turn", minimum=1), 7, values)
     flags.DEFINE_list("only", None, f"rows to measure, of: {', '.join(ROWS)}", flag_values=values)
-    flags.DEFINE_string(
-        "out", None, "directory for bench.json and bench.md; must be new or empty", flag_values=values
-    )
-    flags.DEFINE_string(
-        "bench_python", PYTHON, "interpreter that has PyTorch and Tianshou", flag_values=values
-    )
+    out = "directory for bench.json and bench.md; must be new or empty"
+    flags.DEFINE_string("out", None, out, flag_values=values)
+    other = "interpreter that has PyTorch and Tianshou"
+    flags.DEFINE_string("bench_python", PYTHON, other, flag_values=values)
     quick = "one round of turns a twelfth as long, to try this program; its figures say nothing"
     flags.DEFINE_boolean("quick", False, quick, flag_values=values)
 
@@ -128,10 +127,10 @@ def difference(ours: Sequence[Mapping[str, float]], theirs: Sequence[Mapping[str
 
 
 def start(group: Group, rows: Sequence[str], python: str, stack: contextlib.ExitStack) -> tuple[dict, dict]:
-    """Starts the workers that some rows of a group need, and compares losses with those of their twins.
+    """Starts the workers that some rows of a group need, and compares their losses with their twins'.
 
     Returns:
-        {name: worker}, and {name: the largest relative difference of a loss}, for those that have a twin.
+        {name: worker}, and {name: the largest relative difference of a loss} of those that have a twin.
     """
     workers, checks, checked = {}, {}, {}
     for name, program in group.needed(rows).items():
@@ -191,6 +190,33 @@ def table(lines: Sequence[Sequence[str]]) -> str:
     return "".join(f"| {line} |\n" for line in (head, rule, *rest))
 
 
+def report(
+    rows: Sequence[str], replies: Mapping[str, Any], checks: Mapping[str, float], about: Mapping[str, Any]
+) -> tuple[str, dict[str, Any]]:
+    """The table with what stands around it, and what bench.json holds; see `measure`.
+
+    Rows without replies were skipped.
+    """
+    lines, records = [HEAD], {}
+    for name in rows:
+        row = ROWS[name]
+        lines.append(row.cells(replies))
+        records[name] = {"title": row.title, "unit": row.unit, "goal": row.goal}
+        if row.ours in replies:
+            own = {series: replies[series] for series in row.series}
+            records[name] |= {"figures": row.figures(replies), "rounds": own}
+    text = f"{table(lines)}\nMedians of {about['rounds']} rounds, in brackets their quartiles, on "
+    text += f"{about['cores']} cores of {about['cpu']}.\n"
+    if about["load"] > BUSY:
+        text += f"Other programs were running: load average {about['load']:.1f} at the start.\n"
+    if checks:
+        text += f"Check passed: from equal weights, without noise, the losses of {CHECK_UPDATES} updates are "
+        text += (
+            f"PyTorch's. Largest relative difference: {max(checks.values()):.0e} ({TOLERANCE:.0e} allowed).\n"
+        )
+    return text, {**about, "checks": checks, "rows": records}
+
+
 def bench(values: flags.FlagValues) -> None:
     """Checks the command line, measures, prints and writes.
 
@@ -198,59 +224,38 @@ def bench(values: flags.FlagValues) -> None:
         ConfigError: the command line is not valid; nothing was written.
         WorkerError, CheckFailed: as `measure`.
     """
-    rows = chosen_rows(values["only"].value)
-    path = check_out(values["out"].value)
+    rows, path = chosen_rows(values["only"].value), check_out(values["out"].value)
     quick = values["quick"].value
-    rounds = 1 if quick else values["rounds"].value
     python = str(ROOT / Path(values["bench_python"].value).expanduser())
-    others, load = other_versions(python), os.getloadavg()[0]
     about = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "cpu": cpu_model(),
         "cores": runtime.cores(),
-        "load": load,
+        "load": os.getloadavg()[0],
         "git_revision": git_revision(),
         "versions": versions(),
-        "other_versions": others,
-        "rounds": rounds,
+        "other_versions": other_versions(python),
+        "rounds": 1 if quick else values["rounds"].value,
     }
-    busy = f"other programs were running: load average {load:.1f} at the start" if load > BUSY else ""
-    if busy:
-        display.say(busy)
-    lines, records, checks = [HEAD], {}, {}
+    if about["load"] > BUSY:
+        display.say(f"load average {about['load']:.1f}: other programs distort what is measured")
+    if not about["other_versions"]:
+        display.say(
+            "PyTorch and Tianshou are not there, `make bench-install` installs them; their rows are skipped"
+        )
+    replies, checks = {}, {}
     for group in GROUPS:
         chosen = [name for name in rows if name in group.rows]
-        needing = {name for name in chosen if any(p.is_other for p in group.needed([name]).values())}
-        measured = [name for name in chosen if others or name not in needing]
-        if measured:
-            replies, found = measure(group, measured, rounds=rounds, python=python, quick=quick)
-            checks |= found
-        for name in chosen:
-            row = group.rows[name]
-            records[name] = {"title": row.title, "unit": row.unit, "goal": row.goal}
-            if name in measured:
-                figures = row.figures(replies)
-                lines.append(row.cells(figures))
-                records[name] |= {"figures": figures, "rounds": {one: replies[one] for one in row.series}}
-            else:
-                display.say(
-                    f"skipped for want of PyTorch and Tianshou: {name}; `make bench-install` installs them"
-                )
-                lines.append([row.title, "skipped", "not installed", "-", row.goal])
-                records[name]["skipped"] = True
-    text = table(lines)
-    text += f"\nMedians of {rounds} rounds, in brackets their quartiles, on {about['cores']} cores "
-    text += f"of {about['cpu']}.\n"
-    if busy:
-        text += f"{busy.capitalize()}.\n"
-    if checks:
-        shown = ", ".join(f"{name} {value:.0e}" for name, value in checks.items())
-        text += f"Check passed: from equal weights, without noise, the losses of {CHECK_UPDATES} updates are "
-        text += f"PyTorch's. Largest relative difference ({TOLERANCE:.0e} allowed): {shown}.\n"
+        if not about["other_versions"]:
+            chosen = [name for name in chosen if not any(x.is_other for x in group.needed([name]).values())]
+        if chosen:
+            found = measure(group, chosen, rounds=about["rounds"], python=python, quick=quick)
+            replies |= found[0]
+            checks |= found[1]
+    text, record = report(rows, replies, checks, about)
     print(text, end="")
     if path is not None:
         path.mkdir(parents=True, exist_ok=True)
-        record = {**about, "checks": checks, "rows": records}
         (path / "bench.json").write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         (path / "bench.md").write_text(text, encoding="utf-8")
 

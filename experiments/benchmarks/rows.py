@@ -75,8 +75,11 @@ class Row(NamedTuple):
         ratio = spread([a / b for a, b in pairs])
         return {"ours": spread(ours), "theirs": spread(theirs), "ratio": ratio, "label": label}
 
-    def cells(self, found: Mapping[str, Any]) -> list[str]:
-        """The line of the table that shows these figures."""
+    def cells(self, replies: Mapping[str, Sequence[Sequence[float]]]) -> list[str]:
+        """The line of the table; without replies it says that the row was skipped."""
+        if self.ours not in replies:
+            return [self.title, "skipped", "not installed", "-", self.goal]
+        found = self.figures(replies)
         ours, theirs, ratio = spread_text(found["ours"], self.unit), "-", "-"
         if "theirs" in found:
             theirs = f"{spread_text(found['theirs'], self.unit)}, {found['label']}"
