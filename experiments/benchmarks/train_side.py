@@ -5,6 +5,7 @@
 
 import functools
 import os
+import resource
 import subprocess
 import sys
 import tempfile
@@ -15,27 +16,21 @@ from .. import runtime, train
 from .worker import ROOT
 
 
-def run(module: str, **flags: object) -> tuple[float, float]:
-    """Runs a module to its end, with a run directory that is deleted afterwards.
-
-    Returns:
-        Seconds, and the largest resident size in GB.
+def run(module: str, **flags: object) -> float:
+    """Runs a module to its end, with a run directory that is deleted afterwards. Returns seconds.
 
     Raises:
         ChildProcessError: its exit status was not 0.
     """
-    with tempfile.TemporaryDirectory() as folder, open(f"{folder}/log", "w+", encoding="utf-8") as log:
+    with tempfile.TemporaryDirectory() as folder:
         given = [f"--{name}={value}" for name, value in flags.items()]
         command = [sys.executable, "-m", module, *given, f"--out={folder}/run"]
         start = time.perf_counter()
-        process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=log)
-        _, status, usage = os.wait4(process.pid, 0)
+        done = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
         seconds = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-        log.seek(0)
-        if process.returncode:
-            raise ChildProcessError(f"{module}: {log.read().strip().splitlines()[-1:]}")
-    return seconds, usage.ru_maxrss * (1 if sys.platform == "darwin" else 1024) / 1e9
+    if done.returncode:
+        raise ChildProcessError(f"{module}: {done.stderr.strip().splitlines()[-1:]}")
+    return seconds
 
 
 class Startup:
@@ -47,7 +42,7 @@ class Startup:
 
     def turn(self) -> dict[str, list[float]]:
         """Starts once. Returns "startup", the seconds until the first update has ended."""
-        return {"startup": [run(__name__, preset=self._preset)[0]]}
+        return {"startup": [run(__name__, preset=self._preset)]}
 
 
 class Memory:
@@ -65,9 +60,10 @@ class Memory:
         Returns:
             "memory", the largest resident size in GB; "frames", what the frames of a full buffer take alone.
         """
-        steps = int(1.05 * buffer_size)
-        _, memory = run("experiments.train", steps=steps, buffer_size=buffer_size, **self._flags)
-        return {"memory": [memory], "frames": [buffer_size * 84 * 84 / 1e9]}
+        run("experiments.train", steps=int(1.05 * buffer_size), buffer_size=buffer_size, **self._flags)
+        unit = 1 if sys.platform == "darwin" else 1024  # bytes
+        memory = unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+        return {"memory": [memory / 1e9], "frames": [buffer_size * 84 * 84 / 1e9]}
 
 
 def prepare(tune: str, encoder: str) -> None:
