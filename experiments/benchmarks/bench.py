@@ -202,9 +202,8 @@ def report(
         row = ROWS[name]
         lines.append(row.cells(replies))
         records[name] = {"title": row.title, "unit": row.unit, "goal": row.goal}
-        if row.ours in replies:
-            own = {series: replies[series] for series in row.series}
-            records[name] |= {"figures": row.figures(replies), "rounds": own}
+        if found := row.figures(replies):
+            records[name] |= {"figures": found, "rounds": {series: replies[series] for series in row.series}}
     text = f"{table(lines)}\nMedians of {about['rounds']} rounds, in brackets their quartiles, on "
     text += f"{about['cores']} cores of {about['cpu']}.\n"
     if about["load"] > BUSY:

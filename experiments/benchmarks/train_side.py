@@ -41,8 +41,8 @@ class Startup:
         self.turn()
 
     def turn(self) -> dict[str, list[float]]:
-        """Starts once. Returns "startup", the seconds until the first update has ended."""
-        return {"startup": [run(__name__, preset=self._preset)]}
+        """Starts once. Returns "seconds" until the first update has ended."""
+        return {"seconds": [run(__name__, preset=self._preset)]}
 
 
 class Memory:
@@ -58,12 +58,12 @@ class Memory:
             buffer_size: in transitions of 84 x 84 bytes.
 
         Returns:
-            "memory", the largest resident size in GB; "frames", what the frames of a full buffer take alone.
+            "peak", the largest resident size in GB; "frames", what the frames of a full buffer take alone.
         """
         run("experiments.train", steps=int(1.05 * buffer_size), buffer_size=buffer_size, **self._flags)
         unit = 1 if sys.platform == "darwin" else 1024  # bytes
         memory = unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
-        return {"memory": [memory / 1e9], "frames": [buffer_size * 84 * 84 / 1e9]}
+        return {"peak": [memory / 1e9], "frames": [buffer_size * 84 * 84 / 1e9]}
 
 
 def prepare(tune: str, encoder: str) -> None:
