@@ -45,8 +45,8 @@ class Loop:
         Returns:
             "rate" of the first, env steps a second, to the end of what a row of metrics.jsonl waits for;
             milliseconds of each "iteration", and "busy", processor time to wall-clock time meanwhile. The
-            "slower half" is the greater of two medians: acting and stepping the environments while nothing
-            is updated, and an iteration's updates, with sampling and priorities, while no environment moves.
+            "slower half" of an iteration is the slower one of acting and stepping the environments, while
+            nothing is updated, and its updates, with sampling and priorities, while no environment moves.
         """
         run = self._run
         first, start = run.env_steps, time.perf_counter()
@@ -55,28 +55,24 @@ class Loop:
         self._forget()
         rate = (run.env_steps - first) / (time.perf_counter() - start)
 
-        before, processor = run.updates, time.process_time()
+        processor = time.process_time()
         iteration = [timed(run.step)[0] for _ in range(iterations)]
         busy = 1e3 * (time.process_time() - processor) / sum(iteration)
-        due = (run.updates - before) // iterations
+        before = run.schedules.updates_due(run.env_steps)
         acting = [self._act() for _ in range(iterations)]
         # As many as were left out, so that none is due later.
-        updates = [timed(lambda: [run.update() for _ in range(due)])[0] for _ in range(iterations)]
+        due = run.schedules.updates_due(run.env_steps) - before
+        updates = [timed(run.update)[0] for _ in range(due)]
         self._forget()
-        slower = max(float(np.median(half)) for half in (acting, updates))
-        return {
-            "rate": [rate],
-            "iteration": iteration,
-            "busy": [busy],
-            "slower half": [slower],
-        }
+        slower = float(max(np.median(acting), np.median(updates) * due / iterations))
+        return {"rate": [rate], "iteration": iteration, "busy": [busy], "slower half": [slower]}
 
     def _act(self) -> float:
         """A step of the loop without updates: milliseconds of acting and of the environments' step."""
         run = self._run
         frames = [seed.stacks.observations() for seed in run.seeds]
         now = run.state.params, frames, run.env_steps, run.now.epsilon
-        milliseconds, steps = timed(lambda: run.env_threads.submit(run.act_and_step, *now).result())
+        milliseconds, steps = run.env_threads.submit(timed, run.act_and_step, *now).result()
         for seed, step in zip(run.seeds, steps, strict=True):
             seed.take(step)
         run.env_steps += run.config.num_envs
