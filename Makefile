@@ -19,8 +19,8 @@ STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
 # Tests that start few processes and compile little, half a minute in all.
-FAST := actor arms augment colours config control_groups curves data docs ending envs_base help metrics \
-	optim progress reading replay rl_losses rundir specs statistics sumtree \
+FAST := actor arms augment colours compare config control_groups data docs ending envs_base help metrics \
+	optim plots progress reading replay rl_losses run_data rundir specs statistics sumtree \
 	sweeping_plan sweeping_status window
 
 .DEFAULT_GOAL := help

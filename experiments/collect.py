@@ -19,10 +19,12 @@ from . import packing
 from .directories import natural
 from .run_data import RunData, arm_name, load_run, run_directories
 
+RETURN = "eval/return_mean"
+"""The key of learning curves."""
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
-OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports")
+OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", "loggers")
 """Fields in which runs of one arm and game may differ."""
 
 
@@ -94,11 +96,21 @@ def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:
     return groups
 
 
+def steps_and_values(run: RunData, key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Env steps int64 [N], ascending, and a key's values float64 [N], of rows where it is not null.
+
+    Raises:
+        ConfigError: a value is no number.
+    """
+    found = {row["env_steps"]: row[key] for row in run.rows if row.get(key) is not None}
+    if not all(isinstance(value, int | float) for value in found.values()):
+        raise ConfigError(f"{run.path}: {key} is not a number in each row")
+    return np.array(list(found), np.int64), np.array(list(found.values()), np.float64)
+
+
 def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
-    """The learning curve: env steps int64 [N], ascending, and mean evaluation returns float64 [N]."""
-    rows = [row for row in run.rows if row["kind"] == "eval" and row.get("eval/return_mean") is not None]
-    steps = np.array([row["env_steps"] for row in rows], np.int64)
-    return steps, np.array([row["eval/return_mean"] for row in rows], np.float64)
+    """The learning curve, `steps_and_values` of mean evaluation returns."""
+    return steps_and_values(run, RETURN)
 
 
 def ends(curves: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str, np.ndarray]:
@@ -120,23 +132,24 @@ def has_policy(run: RunData) -> bool:
     return MODES[run.config.mode].rl
 
 
-def comparable(runs: Sequence[RunData]) -> list[RunData]:
-    """Runs whose learning curves can be laid beside each other, in their order; the others, `left_out` has.
+def comparable(runs: Sequence[RunData], key: str = RETURN) -> list[RunData]:
+    """Runs whose curves of a key can be laid beside each other, in their order; the others, `left_out` has.
 
     One that ended with an error is left out however far it got, one without evaluations, and one with a
     single evaluation where others of its game have more: it has only just begun. Each would cut the curves of
     all others down to where it is.
     """
-    return [run for run, why in zip(runs, _why_not(runs), strict=True) if not why]
+    return [run for run, why in zip(runs, _why_not(runs, key), strict=True) if not why]
 
 
-def left_out(runs: Sequence[RunData]) -> list[tuple[RunData, str]]:
-    """The runs with a policy that are not `comparable`, and why."""
-    return [(run, why) for run, why in zip(runs, _why_not(runs), strict=True) if why and has_policy(run)]
+def left_out(runs: Sequence[RunData], key: str = RETURN) -> list[tuple[RunData, str]]:
+    """The runs that are not `comparable`, and why; of returns, those with a policy."""
+    whys = zip(runs, _why_not(runs, key), strict=True)
+    return [(run, why) for run, why in whys if why and (key != RETURN or has_policy(run))]
 
 
-def _why_not(runs: Sequence[RunData]) -> list[str]:
-    points = [0 if run.failed else len(steps_and_returns(run)[0]) for run in runs]
+def _why_not(runs: Sequence[RunData], key: str) -> list[str]:
+    points = [0 if run.failed else len(steps_and_values(run, key)[0]) for run in runs]
     under_way = {run.game for run, count in zip(runs, points, strict=True) if count > 1}
     found = []
     for run, count in zip(runs, points, strict=True):
@@ -144,7 +157,7 @@ def _why_not(runs: Sequence[RunData]) -> list[str]:
         if run.failed:
             why = run.ended.reason
         elif count == 0:
-            why = "not evaluated yet"
+            why = "not evaluated yet" if key == RETURN else f"has no {key}"
         elif count == 1 and run.game in under_way:
             why = "has only begun"
         found.append(why)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from srl_jax import checkpoint, display, ending, rundir
+from srl_jax import checkpoint, display, ending, loggers, rundir
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import PARTIAL, SOURCES, Config, another_run, changes, record_changes
 from srl_jax.errors import ConfigError, SaveError
@@ -138,7 +138,8 @@ def blank(path: Path) -> bool:
             return unwritten and all(kept.name == f"{0:09d}" for kept in _finished(entry))
         if entry.name == "checkpoints":
             return unwritten and not _finished(entry)
-        return entry.name == "config.json" or (unwritten and entry.name in ("metrics.jsonl", "tensorboard"))
+        written = ("metrics.jsonl", *loggers.WRITTEN)
+        return entry.name == "config.json" or (unwritten and entry.name in written)
 
     return all(left(entry) for entry in path.iterdir())
 

@@ -24,7 +24,7 @@ from srl_jax.data import published, reference_policies
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
 
-from . import collect, curves, packing, plots
+from . import collect, packing, plots
 from . import flags as config_flags
 from .arms import FIGURES, Figure, figures_named
 from .collect import RunData, comparable, steps_and_returns
@@ -147,7 +147,7 @@ def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.nd
     return found | {"probability_of_improvement": _limits(better)}
 
 
-def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[curves.Level]:
+def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[plots.Level]:
     """Published scores as lines that say what differs from these runs.
 
     Args:
@@ -161,7 +161,7 @@ def published_levels(game: str, methods: Sequence[str], config: Config, until: i
         found = [entry for entry in published(game) if entry.method == method]
         if found:
             entry = min(found, key=lambda entry: abs((entry.env_steps or 0) - until))
-            levels.append(curves.Level(method, entry.score, entry.differs_from(config, until)))
+            levels.append(plots.Level(method, entry.score, entry.differs_from(config, until)))
     return levels
 
 
@@ -179,11 +179,11 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
         for arm in figure.arms:
             if (values := entry["arms"].get(arm.name)) is not None:
                 limits = (np.array(values[key], float) for key in ("mean", "low", "high"))
-                seeds, thesis = len(values["seeds"]), arm.thesis_curve(game)
-                lines.append(curves.Line(arm.name, values["env_steps"], *limits, seeds, thesis))
-        policies = [curves.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
-        levels = [curves.Level(**level) for level in entry["published"]]
-        panels.append(curves.Panel(game, lines, levels, policies))
+                curve = plots.Curve(values["env_steps"], *limits)
+                lines.append(plots.Line(arm.name, curve, len(values["seeds"]), arm.thesis_curve(game)))
+        policies = [plots.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
+        levels = [plots.Level(**level) for level in entry["published"]]
+        panels.append(plots.Panel(game, lines, levels, policies))
     kinds = {arm["kind"] for entry in numbers["games"].values() for arm in entry["arms"].values()}
     kinds = ", ".join(sorted(kinds - {statistics.NONE}))
     note = f"bands: 95 % intervals over seeds at each point, {kinds}" if kinds else "single seeds: no bands"
@@ -193,7 +193,7 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
         note += "; PROTOCOLS DIFFER between runs"
     looks = {arm: tuple(style) for arm, style in numbers["styles"].items()}
     note = "\n".join([note, *left_out_lines(numbers)])
-    return curves.comparison(panels, path, f"{figure.name}  {figure.title}", note, looks)
+    return plots.draw_panels(panels, path, f"{figure.name}  {figure.title}", note, looks)
 
 
 def left_out_lines(numbers: Mapping[str, Any]) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 
 from absl import app, flags
 
-from srl_jax import display, modes, plugins, specs
+from srl_jax import display, loggers, modes, plugins, specs
 from srl_jax.config import INFOS, Config, unresolved
 from srl_jax.errors import EXIT_STATUS, ConfigError
 from srl_jax.reading import SETTINGS, read_bytes
@@ -33,6 +33,7 @@ MOVED = {
     **{name: f"--rl=:{name}=..." for name in ("n_step", "v_min", "v_max", "noisy_std", "alpha")},
     "num_atoms": "--rl=:atoms=...",
     "lr_final": "--lr_final_share=...",
+    "tensorboard": "--logger=tensorboard",
 }
 """{flag that there was: how its value is given now}; `--rl=:KEY=...` leaves the other options as they are."""
 
@@ -220,6 +221,8 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
             given[name] = () if texts in (("none",), ("",)) else texts
     if "imports" in given:
         given["imports"] = tuple(map(plugins.located, given["imports"]))
+    if "loggers" in given:
+        given["loggers"] = loggers.listed(given["loggers"])
     if "objectives" in given:
         given["objectives"] = with_objectives(base.get("objectives", ()), given["objectives"])
     for name in ("rl", "encoder"):

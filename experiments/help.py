@@ -22,7 +22,7 @@ GROUPS: dict[str, str] = {
     "max_grad_norm adam_eps",
     "Evaluation": "eval_every eval_games eval_max_steps eps_eval stop_at_return diagnostics diagnostics_kept",
     "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every keep_best keep_replay "
-    "tensorboard print_config tune_runtime",
+    "logger print_config tune_runtime",
 }
 """Flags of training, in the order in which they are shown; others are a program's own."""
 
@@ -90,9 +90,10 @@ def _flag(name: str, values: flags.FlagValues) -> Iterator[str]:
 
 def _rows() -> dict[str, dict[str, dict[str, Any]]]:
     """{flag: {row of its registry: {option: default}}}; imports jax."""
-    from srl_jax import encoders, objectives, rl
+    from srl_jax import encoders, loggers, objectives, rl
 
     registries = {"rl": rl.REGISTRY, "encoder": encoders.REGISTRY, "objective": objectives.REGISTRY}
+    registries["logger"] = loggers.REGISTRY
     return {
         flag: {name: specs.option_defaults(row) for name, row in registry.items()}
         for flag, registry in registries.items()
@@ -104,7 +105,7 @@ def _listed(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     for place, (name, options) in enumerate(rows.items()):
         line = specs.join(name, options)
         for other in list(rows)[:place]:
-            if rows[other].keys() == options.keys():
+            if options and rows[other].keys() == options.keys():
                 differing = {key: x for key, x in options.items() if x != rows[other][key]}
                 line = f"{name}: {specs.join(other, differing)}"
                 break

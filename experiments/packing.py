@@ -27,8 +27,7 @@ from srl_jax.reading import parse_json, read_bytes, replace_bytes, replace_text
 
 from . import flags as config_flags
 from .directories import natural, runs_below
-from .draw import check_rows
-from .run_data import RunData, load_run, run_directories
+from .run_data import RunData, check_rows, load_run, run_directories
 
 FLAGS = flags.FLAGS
 

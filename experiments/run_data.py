@@ -9,11 +9,14 @@ from typing import Any, NamedTuple
 
 from srl_jax import ending
 from srl_jax.config import Config
+from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
 from srl_jax.ending import Ending
+from srl_jax.errors import ConfigError
+from srl_jax.metrics import KINDS, read_metrics
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
+from srl_jax.specs import LIMITS
 
 from .directories import runs_below
-from .draw import read_rows
 
 
 class RunData(NamedTuple):
@@ -72,3 +75,61 @@ def run_directories(root: Path) -> list[Path]:
     """
     below = runs_below(root)
     return [path for path in below if not any(".broken-" in part for part in path.relative_to(root).parts)]
+
+
+def read_rows(path: Path) -> list[dict]:
+    """`srl_jax.metrics.read_metrics`, with what is drawn of each row checked.
+
+    Raises:
+        ConfigError: it cannot be read, or holds something else than training writes; one line.
+    """
+    try:
+        rows = read_metrics(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    check_rows(rows, str(path))
+    return rows
+
+
+def check_rows(rows: list[dict], name: str) -> None:
+    """Whether what is drawn of rows is what training writes.
+
+    Args:
+        rows: as `read_metrics` gives them.
+        name: what they are the rows of, for errors.
+
+    Raises:
+        ConfigError: it is something else; one line.
+    """
+    for number, row in enumerate(rows, 1):
+        if row.get("kind") not in KINDS:
+            raise ConfigError(f"{name}, line {number}: kind is none of {', '.join(KINDS)}")
+        if not _is_count(row.get("env_steps")):
+            raise ConfigError(f"{name}, line {number}: env_steps is no count")
+        for key, value in row.items():
+            kind = key.partition("/")[0]
+            if key in ("eval/returns", STEPS):
+                good = isinstance(value, list) and all(map(_is_count if key == STEPS else _is_number, value))
+            elif kind == "diag" and isinstance(value, list):
+                good = all(map(_is_number, value))
+            else:
+                drawn = kind in ("loss", "grad_norm", "diag") or key == "eval/return_mean"
+                good = not drawn or _is_number(value)
+            if not good:
+                raise ConfigError(f"{name}, line {number}: {key} is not made of numbers of single precision")
+    for kind in drift_names(rows):
+        try:
+            drift_matrix(rows, kind)
+        except ValueError as error:
+            raise ConfigError(f"{name}: {error}") from None
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= LIMITS[int]
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that single precision holds, or null."""
+    return value is None or (type(value) in (int, float) and abs(value) <= LIMITS[float])

@@ -8,7 +8,6 @@ the run; a second Ctrl-C or SIGTERM ends it at once.
 import contextlib
 import dataclasses
 import functools
-import importlib.util
 import os
 import signal
 from collections.abc import Callable
@@ -84,8 +83,6 @@ def check_extras(config: Config) -> None:
         ConfigError: they cannot; the line says why, or which extra has the package.
     """
     check_game(config)
-    if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
-        raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
 
 
 def say_unused(values: flags.FlagValues, game: str) -> None:
@@ -193,7 +190,7 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
         SaveError: they cannot be written.
     """
     from . import plots
-    from .draw import draw_run
+    from .run_figures import draw_run
 
     if not plots.available():
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")

@@ -178,7 +178,12 @@ class Config:
         int, 10, "epochs whose encoders and decoders are kept in encoders/, to measure drift against",
         "epochs", minimum=0, maximum=1_000,
     )  # fmt: skip
-    tensorboard: bool = _value(bool, False, "also write TensorBoard events")
+    loggers: tuple[str, ...] = _value(
+        tuple, (),
+        "where rows go beside metrics.jsonl: tensorboard, wandb, csv, or module:Logger, a class of your own "
+        "(see srl_jax/loggers.py); may be repeated, or a list with commas; none stands for no logger",
+        flag="logger",
+    )  # fmt: skip
 
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
     life_loss: bool = _value(bool, True, "a lost life ends the return, but not the game, in training")
@@ -215,7 +220,7 @@ class Config:
     pretrain_epsilon: float = _share(0.3, "epsilon of the behaviour policy in --mode=pretrain")
     imports: tuple[str, ...] = _value(
         tuple, (),
-        "file (my_file.py) or module that registers objectives, encoders or RL algorithms of your own, see "
+        "file (my_file.py) or module that registers own objectives, encoders, RL algorithms or loggers, see "
         "srl_jax/plugins.py; may be repeated",
         flag="import",
     )  # fmt: skip
@@ -276,6 +281,8 @@ class Config:
         if not isinstance(values, dict):
             raise ConfigError("config: not a JSON object")
         values = {_RENAMED.get(name, name): value for name, value in values.items() if name not in _ABOUT}
+        if values.pop("tensorboard", False):  # before there were loggers
+            values.setdefault("loggers", ["tensorboard"])
         for name in values:
             if name not in INFOS:
                 raise ConfigError(f"config: no field {name!r}; {specs.choices_text(name, INFOS)}")
@@ -361,8 +368,8 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
 
 
-MAY_CHANGE = ("steps", "stop_at_return", "keep_replay", "keep_best", "imports")
-"""Fields that may change when a run is resumed: when it ends, what it leaves, where its plug-ins lie."""
+MAY_CHANGE = ("steps", "stop_at_return", "keep_replay", "keep_best", "imports", "loggers")
+"""Fields that may change when a run is resumed: when it ends, what it leaves, its plug-ins and loggers."""
 
 
 def another_run(there: Config, here: Config) -> str:
@@ -416,8 +423,8 @@ def record_changes(run: str | Path, env_steps: int, config: Config) -> None:
         OSError: it could not be written.
     """
     about, _ = _read(run)
-    values = json.loads(config.to_json())
-    settings = {name: values[name] for name in MAY_CHANGE if about.get(name, values[name]) != values[name]}
+    there, values = Config.load(run), json.loads(config.to_json())
+    settings = {name: values[name] for name in MAY_CHANGE if getattr(there, name) != getattr(config, name)}
     changed = {name: now for name, (_, now) in changes(run).items()}
     if settings or changed:
         continued = {"env_steps": env_steps, "started": _now(), "changed": changed, "settings": settings}

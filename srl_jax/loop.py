@@ -199,6 +199,7 @@ class Run:
             for i, seed in enumerate(self.seeds):
                 params = self.device.part(self.state.params, i)
                 drawn = pictures(self.agent, params, seed.replay, self.now.beta)
+                seed.report.pictures(self.env_steps, drawn)
                 saved = seed.saved and seed.saved.env_steps
                 counts = self.env_steps, self.updates, not finished, saved
                 results.append(Result(*counts, drawn, seed.recording))

@@ -88,7 +88,7 @@ class Seed:
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
         self.rng = np.random.default_rng(seed_for(config.seed, "random policy"))
         self.policy: Policy = random_policy(int(env.single_action_space.n), self.rng)  # without RL
-        self.report = Report(out, config.steps, progress=progress, tensorboard=config.tensorboard)
+        self.report = Report(out, config, progress=progress)
         self.diagnostics: Diagnostics | None = None
         if config.diagnostics:
             say = self.report.progress.note
@@ -166,7 +166,7 @@ class Seed:
             "replay": (self.replay.snapshot, self.replay.restore),
             "env": (lambda: (self.env.snapshot(), None), lambda arrays, _: self.env.restore(arrays)),
             "play": (self._snapshot, self._restore),
-            "report": (lambda: ({}, self.report.snapshot()), lambda _, x: self.report.restore(x, env_steps)),
+            "report": (lambda: ({}, self.report.snapshot()), lambda _, x: self.report.restore(x)),
         }
 
     def _snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

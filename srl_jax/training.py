@@ -74,14 +74,15 @@ def resolved(config: Config) -> Config:
 
     Raises:
         ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
-            these frames.
+            these frames, or a logger's package is missing.
     """
-    from srl_jax import encoders, objectives, rl
+    from srl_jax import encoders, loggers, objectives, rl
     from srl_jax.types import Context
 
     if config.imports:
         plugins.load(config.imports)
         check_game(config, imported=True)
+    loggers.check(config.loggers)
     full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
     # Options may be valid one by one and not together, or not for these frames: only a factory
     # knows. The number of actions is not known yet; any will do for that.

@@ -1,5 +1,6 @@
 """Tests of the command line: experiments.flags and experiments.train."""
 
+import importlib.util
 import json
 import os
 import pathlib
@@ -100,12 +101,14 @@ def test_every_field_is_a_flag_with_help_and_its_default():
 
 def test_flags_set_the_fields():
     config = _config(
-        "--game=MsPacman", "--steps=1e6", "--gamma=0.9", "--notensorboard", "--reward_clip=false",
+        "--game=MsPacman", "--steps=1e6", "--gamma=0.9", "--nokeep_best", "--reward_clip=false",
         "--stop_at_return=-3.5", "--mode=joint", "--objective=a:weight=1,size=2", "--objective=b",
+        "--logger=csv,wandb:project=x", "--logger=tensorboard",
     )  # fmt: skip
     assert config == Config(
         game="MsPacman", steps=1_000_000, gamma=0.9, reward_clip=False, stop_at_return=-3.5,
-        mode="joint", objectives=("a:weight=1,size=2", "b"),
+        mode="joint", objectives=("a:weight=1,size=2", "b"), keep_best=False,
+        loggers=("csv", "wandb:project=x", "tensorboard"),
     )  # fmt: skip
 
 
@@ -206,6 +209,9 @@ BAD = [
     (["--n_step=3"], "--n_step", "is now --rl=:n_step=..."),
     (["--num_atoms=3"], "--num_atoms", "is now --rl=:atoms=..."),
     (["--lr_final=0.1"], "--lr_final", "is now --lr_final_share=..."),
+    (["--tensorboard"], "--tensorboard", "is now --logger=tensorboard"),
+    (["--logger=csvv"], "--logger=csvv", "did you mean csv? valid: tensorboard, wandb, csv"),
+    (["--logger=nowhere/mine.py:Mine"], "--logger=", "nowhere/mine.py: no such file"),
     (["--rl=:n_step=0"], "--rl=rainbow:n_step=0", "at least 1"),
     (["--rl=:n_step"], "--rl=:n_step", "'n_step' is not key=value"),
     (["--encoder=:n_step=1"], "--encoder=nature:n_step=1", "nature has no option"),
@@ -230,7 +236,7 @@ BAD = [
     (["--gane=Pong"], "--gane", "did you mean --game"),
     (["--lr=1"], "--lr: no such flag", "did you mean --lr_encoder or --lr_encoder_srl or"),
     (["Pong"], "'Pong'", "--name=value"),
-    (["--notensorboard=1"], "--notensorboard=1", "argument"),
+    (["--nokeep_best=1"], "--nokeep_best=1", "argument"),
     (["--flagfile=/dev/zero"], "--flagfile", "write the flags themselves"),
     (["--steps=3000000000"], "--steps=3000000000", "at most 2147483647 (env steps)"),
     (["--rl=rainbow:alpha=2"], "--rl=rainbow:alpha=2", "alpha must be at most 1"),
@@ -634,11 +640,12 @@ def test_a_game_that_cannot_be_made_leaves_nothing(capsys, loop, tmp_path):
 
 
 def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):
-    monkeypatch.setattr(train.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit):
         _train("--game=Pong", f"--out={tmp_path}/a")
     assert "--game=Pong: Atari needs ale-py" in capsys.readouterr().err
-    assert "--tensorboard" in _refused(capsys, "--tensorboard", f"--out={tmp_path}/a")
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert "needs wandb: pip install wandb" in _refused(capsys, "--logger=wandb", f"--out={tmp_path}/a")
 
 
 @pytest.mark.parametrize("preset", PRESETS)

@@ -333,6 +333,9 @@ def test_config_json_has_what_xla_was_told(tmp_path, monkeypatch):
 
 def test_a_config_of_before_a_field_was_renamed_is_read():
     assert Config.from_json('{"lr_final": 0.25}') == Config(lr_final_share=0.25)
+    assert Config.from_json('{"tensorboard": true}') == Config(loggers=("tensorboard",))
+    assert Config.from_json('{"tensorboard": false}') == Config()
+    assert Config.from_json('{"tensorboard": true, "loggers": []}') == Config()  # resumed since, without
 
 
 def test_what_follows_from_other_fields_follows_again():

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import diagnostic_plots, draw, plots
+from experiments import plots, run_figures
 from srl_jax import checkpoint, envs
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout, measures
@@ -336,11 +336,11 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
 @pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
 def test_drift_is_drawn_as_a_matrix_and_numbers_as_curves(tmp_path, monkeypatch):
     figures = []
-    save = diagnostic_plots.save
-    monkeypatch.setattr(diagnostic_plots, "save", lambda f, path: figures.append(f) or save(f, path))
+    save = plots.save
+    monkeypatch.setattr(plots, "save", lambda f, path: figures.append(f) or save(f, path))
     rows = rows_of([0, 10, 20])
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    written = draw.draw_run(tmp_path, Config())
+    written = run_figures.draw_run(tmp_path, Config())
     assert {path.name for path in written} == {"diagnostics.png", "drift.png"}
     (shown,) = figures[1].axes[0].images
     np.testing.assert_allclose(shown.get_array(), drift_matrix(rows, "x")[1])
@@ -349,7 +349,7 @@ def test_drift_is_drawn_as_a_matrix_and_numbers_as_curves(tmp_path, monkeypatch)
     rows[3]["diag/drift/steps"].pop()
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     with pytest.raises(ConfigError, match="metrics.jsonl: drift of x after 30 env steps"):
-        draw.draw_run(tmp_path, Config())
+        run_figures.draw_run(tmp_path, Config())
 
 
 # Atari

@@ -305,12 +305,15 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_the_last_checkpoint(tmp_path, mon
 
     monkeypatch.setattr(Replay, "add", add)
     path = tmp_path / "run"
-    result = train(path, **JOINT, checkpoint_every=40, progress=True)
+    pytest.importorskip("tensorboardX")
+    result = train(path, **JOINT, checkpoint_every=40, progress=True, loggers=("tensorboard",))
     # The step from 96 to 100 was being added; it does not count.
     assert result.interrupted and result.env_steps == 96
     assert "interrupted after 96 env steps; the last checkpoint is of 80" in capsys.readouterr().err
     assert whole(path).env_steps == 80 and "run.json" in whole(path).files
     assert "reconstruction" in result.pictures
+    (events,) = (path / "tensorboard").iterdir()
+    assert b"pictures/reconstruction" in events.read_bytes()
 
 
 def test_a_run_that_is_told_to_stop_saves_and_says_so(tmp_path, capsys):

@@ -73,7 +73,12 @@ def test_the_wheel_has_one_top_level_name_and_everything_that_runs(tmp_path):
         file.extractall(tmp_path / "installed")
     assert {name.split("/")[0].split("-")[0] for name in names} == {"srl_jax"}
     assert not [name for name in names if re.search("soak|benchmark|results/", name)]
-    assert "srl_jax/experiments/reporting/style.css" in names and "srl-jax = srl_jax.__main__:main" in scripts
+    page = {
+        path.relative_to(ROOT) for path in (ROOT / "experiments/reporting").rglob("*.*") if path.is_file()
+    }
+    page = {f"srl_jax/{path}" for path in page if path.suffix != ".pyc"}
+    assert "srl_jax/experiments/reporting/templates/page.html.j2" in page and page <= set(names)
+    assert "srl-jax = srl_jax.__main__:main" in scripts
     done = _command("train", "--game=Pogn", cwd=tmp_path, env={"PYTHONPATH": str(tmp_path / "installed")})
     assert (done.returncode, done.stderr[:19]) == (2, "error: --game=Pogn:")
 

@@ -36,6 +36,18 @@ def test_an_arm_may_be_the_source_of_another():
     assert alone == Planned("Pong/a/seed0", "small/frozen_256", alone.flags) or alone.sources == []
 
 
+def test_what_a_process_elsewhere_imports_is_named_absolutely(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("")
+    flags = {"import": ("mine",), "logger": ("csv,mine.py:Mine", "wandb:project=a")}
+    (run,) = plan.plan([arm_of("small/joint_256")], ["Catch"], [0], flags)
+    assert run.flags["import"] == (f"{tmp_path}/mine.py",)
+    assert run.flags["logger"] == ("csv", f"{tmp_path}/mine.py:Mine", "wandb:project=a")
+    assert manifest.parsed(run).loggers == run.flags["logger"]
+    (run,) = plan.plan([arm_of("small/joint_256")], ["Catch"], [0], {"logger": "none"})
+    assert run.flags["logger"] == ("none",) and manifest.parsed(run).loggers == ()
+
+
 @pytest.mark.parametrize(
     "arms, games, flags, says",
     [

@@ -14,13 +14,15 @@ from tests.helpers import SMALL
 
 def test_a_run_is_trained_into_a_new_directory_and_loaded(tmp_path):
     path = tmp_path / "runs" / "x"
-    config = Config(**{**SMALL, "steps": 120, "eval_every": 60, "keep_encoder_every": 1})
+    config = Config(**{**SMALL, "steps": 120, "eval_every": 60, "keep_encoder_every": 1}, loggers=("csv",))
     result = srl_jax.train(config, str(path), progress=False)
     assert (result.env_steps, result.interrupted) == (120, False)
     assert ending.read(path).status == "finished" and not (path / "lock").exists()
     # config.json has every option, as the command writes it.
     assert Config.load(path) == resolved(config) != config
-    assert read_metrics(path / "metrics.jsonl")[-1]["env_steps"] == 120
+    rows = read_metrics(path / "metrics.jsonl")
+    assert rows[-1]["env_steps"] == 120
+    assert len((path / "metrics.csv").read_text().splitlines()) == 1 + len(rows)
     loaded = srl_jax.load(path)
     assert loaded.env_steps == 120 and loaded.config == resolved(config)
     assert srl_jax.load(path / "best").act(np.zeros((2, 42, 42, 4), np.uint8)).shape == (2,)
@@ -37,6 +39,7 @@ def test_a_run_is_trained_into_a_new_directory_and_loaded(tmp_path):
         ({"mode": "frozen"}, "--encoder_from: --mode=frozen needs"),
         ({"rl": "rainboww"}, "--rl=rainboww: no 'rainboww'; did you mean rainbow"),
         ({"rl": "c51:n_step=0"}, "--rl=c51:n_step=0: n_step must be at least 1"),
+        ({"loggers": ("csvv",)}, "--logger=csvv: no 'csvv'; did you mean csv"),
         ({"game": "no_module_here:Game-v0"}, "--game=no_module_here:Game-v0: "),
         ({"mode": "frozen", "encoder_from": "nowhere"}, "--encoder_from=nowhere: "),
         ({"buffer_size": 35, "learn_start": 8}, "--buffer_size=35: capacity must be at least 36"),

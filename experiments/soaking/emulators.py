@@ -17,9 +17,9 @@ from srl_jax import envs, loop
 from srl_jax.actor import seed_for
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
+from srl_jax.display import Progress
 from srl_jax.envs.atari import COUNTERS
 from srl_jax.loop import Run
-from srl_jax.progress import Progress
 from srl_jax.types import Window
 
 from . import Count, Say

@@ -313,7 +313,7 @@ def _flags() -> Iterator[Case]:
         "three dashes": ("---steps=5", "-steps"),
         "a word": ("Pong", "Pong"),
         "no of a number": ("--nosteps", "nosteps"),
-        "no with a value": ("--notensorboard=5", "tensorboard"),
+        "no with a value": ("--nokeep_best=5", "keep_best"),
         "a switch with a value": ("--overwrite=perhaps", "overwrite"),
         "print_config with a value": ("--print_config=perhaps", "print_config"),
         "a name that is not ASCII": ("--\u017fteps=5", "teps"),

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from srl_jax import envs
-from srl_jax.progress import Progress
+from srl_jax.display import Progress
 
 from . import Count, Say
 

@@ -90,7 +90,7 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
     known: dict[Config, Config] = {}  # what differs by the seed alone is resolved once
     for run in runs:
         try:
-            config = _parsed(run)
+            config = parsed(run)
             key = dataclasses.replace(config, seed=0)
             if key not in known:
                 check_extras(config)
@@ -103,7 +103,7 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
     return entries
 
 
-def _parsed(run: Planned) -> Config:
+def parsed(run: Planned) -> Config:
     """The configuration of a run's command line, not yet resolved.
 
     Raises:

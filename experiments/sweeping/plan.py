@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from srl_jax import envs, plugins
+from srl_jax import envs, loggers, plugins
 from srl_jax.config import INFOS
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
@@ -198,6 +198,9 @@ def _checked(flags: Flags) -> dict[str, str | tuple[str, ...]]:
     if "import" in own:
         texts = (own["import"],) if isinstance(own["import"], str) else own["import"]
         own["import"] = tuple(text if text == "none" else plugins.located(text) for text in texts)
+    if "logger" in own:
+        texts = (own["logger"],) if isinstance(own["logger"], str) else own["logger"]
+        own["logger"] = loggers.listed(texts) or ("none",)
     return own
 
 

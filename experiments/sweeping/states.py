@@ -52,7 +52,7 @@ def look(path: Path, config: Config) -> State:
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     if not blank:
-        names = [name for name in INFOS if name != "imports"]  # which may lie elsewhere by now
+        names = [name for name in INFOS if name not in ("imports", "loggers")]  # may be others by now
         if differing := difference(Config.load(path), config, names):
             raise ConfigError(
                 f"{path}: the run there has another configuration: {differing}; give the flags that it was "

@@ -8,12 +8,12 @@ import math
 import os
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import timedelta
 from pathlib import Path
 from typing import NamedTuple
 
 from srl_jax import checkpoint, envs, statistics
 from srl_jax.config import Config
+from srl_jax.display import hms
 from srl_jax.errors import ConfigError
 
 from .. import collect, packing
@@ -139,11 +139,6 @@ def _sources_first(entries: Mapping[str, Entry]) -> Iterable[str]:
     return order.static_order()
 
 
-def duration(seconds: float) -> str:
-    """1:01:01 for 3661 seconds."""
-    return str(timedelta(seconds=round(seconds)))
-
-
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Rows as lines, their cells below each other; the first cell to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -198,7 +193,7 @@ def lines(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
         }
         at_once = counts["running"] or workers
         seconds, unknown = seconds_left(entries, steps, rates(root, entries), at_once)
-        parts.append(f"{duration(seconds)} left" if seconds else "time left unknown")
+        parts.append(f"{hms(seconds)} left" if seconds else "time left unknown")
         if seconds and unknown:
             parts[-1] += f" and {unknown} of unknown speed"
     rows = [("run", "env steps", "steps/s", "left", "evaluation", "by")]
@@ -211,7 +206,7 @@ def lines(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
 def _row(root: Path, entry: Entry, by: str) -> tuple[str, ...]:
     (run, config), got = entry, progress(root / entry.run.name)
     rate, left = got.per_s, max(config.steps - got.env_steps, 0)
-    times = ("", "") if rate is None else (f"{rate:,.0f}", duration(left / rate))
+    times = ("", "") if rate is None else (f"{rate:,.0f}", hms(left / rate))
     score = "" if got.evaluation is None else f"{got.evaluation:.4g}"
     return run.name, f"{got.env_steps:,}/{config.steps:,}", *times, score, by
 
@@ -221,7 +216,7 @@ def ended_text(run: Path) -> str:
     got = progress(run)
     steps = checkpoint.read_manifest(run).env_steps  # the last row may be of before the end
     score = "" if got.evaluation is None else f", last evaluation {got.evaluation:.4g}"
-    return f"{steps:,} env steps in {duration(got.seconds)}{score}"
+    return f"{steps:,} env steps in {hms(got.seconds)}{score}"
 
 
 def dry_run(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
@@ -243,7 +238,7 @@ def dry_run(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]
     rows = [("arm", "runs", "done", "to run", "env steps", "steps/s", "time")]
     for arm, names in arms.items():
         todo, rate = [left[name] for name in names if name in left], per_s[names[0]]
-        times = ("unknown", "unknown") if rate is None else (f"{rate:,.0f}", duration(sum(todo) / rate))
+        times = ("unknown", "unknown") if rate is None else (f"{rate:,.0f}", hms(sum(todo) / rate))
         counts = map(str, (len(names), len(names) - len(todo), len(todo)))
         rows.append((arm, *counts, f"{sum(todo):,}", *times))
     lines = columns(rows)
@@ -251,7 +246,7 @@ def dry_run(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]
     seconds, unknown = seconds_left(entries, left, per_s, workers)
     line = f"{len(left)} of {len(entries)} runs to run, {sum(left.values()):,} env steps"
     if left:
-        line += f", {duration(seconds) if seconds else 'unknown time'} with {workers} at once"
+        line += f", {hms(seconds) if seconds else 'unknown time'} with {workers} at once"
         line += f" and {unknown} runs of unknown speed" if seconds and unknown else ""
     lines.append(line)
     if unknown:

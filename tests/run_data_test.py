@@ -1,13 +1,11 @@
-"""Tests of experiments.draw: what is drawn is checked first."""
+"""Tests of experiments.run_data: what is drawn is checked first."""
 
 import json
 import os
 
-import numpy as np
 import pytest
 
-from experiments import draw, plots
-from srl_jax.config import Config
+from experiments import run_data
 from srl_jax.specs import ConfigError
 
 EVAL = {"kind": "eval", "env_steps": 5, "eval/return_mean": 1.0, "eval/returns": [1.0, None]}
@@ -20,7 +18,7 @@ def _write(run, *rows):
 
 
 def test_rows_as_training_writes_them(tmp_path):
-    assert draw.read_rows(_write(tmp_path, TRAIN, EVAL)) == [TRAIN, EVAL]
+    assert run_data.read_rows(_write(tmp_path, TRAIN, EVAL)) == [TRAIN, EVAL]
 
 
 @pytest.mark.parametrize(
@@ -48,39 +46,17 @@ def test_rows_as_training_writes_them(tmp_path):
 def test_other_rows_are_refused_with_their_line(change, reason, tmp_path):
     path = _write(tmp_path, TRAIN, {**EVAL, **change})
     with pytest.raises(ConfigError) as error:
-        draw.read_rows(path)
+        run_data.read_rows(path)
     assert str(error.value).startswith(f"{path}, line 2: {reason} ")
 
 
 def test_what_is_no_metrics_file_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="metrics.jsonl: No such file"):
-        draw.read_rows(tmp_path / "metrics.jsonl")
+        run_data.read_rows(tmp_path / "metrics.jsonl")
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(ConfigError, match="pipe: Not a regular file"):
-        draw.read_rows(tmp_path / "pipe")
+        run_data.read_rows(tmp_path / "pipe")
     path = _write(tmp_path)
     path.write_text("[" * 100_000 + "\n")
     with pytest.raises(ConfigError, match="line 1: nested too deeply"):
-        draw.read_rows(path)
-
-
-@pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
-@pytest.mark.parametrize("size, scale", [(42, 2), (84, 1), (200, 1)])
-def test_a_recording_becomes_a_gif_of_the_same_size(tmp_path, size, scale):
-    from PIL import Image
-
-    _write(tmp_path)
-    frames = np.zeros((3, size, size, 1), np.uint8)
-    frames[1, 5] = 255
-    (path,) = draw.draw_run(tmp_path, Config(), recording=frames)
-    with Image.open(path) as image:
-        assert path.name == "play.gif" and image.n_frames == 3 and image.size == (scale * size,) * 2
-
-
-@pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
-def test_names_are_drawn_as_they_are(tmp_path):
-    # Between dollar signs, matplotlib would read TeX.
-    _write(tmp_path, {**TRAIN, "loss/$\\frac$": 1.0}, EVAL)
-    config = Config(encoder="$\\frac$")
-    written = draw.draw_run(tmp_path, config)
-    assert [path.name for path in written] == ["learning_curve.png", "losses.png"]
+        run_data.read_rows(path)
