@@ -16,8 +16,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 
 from . import packing
-from .directories import natural
-from .run_data import RunData, arm_name, load_run, run_directories
+from .run_data import RunData, arm_name, load_run, natural, run_directories
 
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""

@@ -26,9 +26,8 @@ from srl_jax.reading import ROWS as MOST_BYTES
 from srl_jax.reading import parse_json, read_bytes, replace_bytes, replace_text
 
 from . import flags as config_flags
-from .directories import natural, runs_below
 from .draw import check_rows
-from .run_data import RunData, load_run, run_directories
+from .run_data import RunData, load_run, natural, run_directories, runs_below
 
 FLAGS = flags.FLAGS
 
@@ -72,7 +71,7 @@ def read(folder: Path, *, only_last: bool = False) -> list[RunData]:
     for arm, about, run in entries:
         path = folder / CONFIGS
         try:
-            config = Config.from_json(json.dumps(about))
+            config = Config.from_values(about)
             ended = Ending(**run["ended"]) if run["ended"] else None
             place = folder / run["path"]
         except (KeyError, TypeError) as error:

@@ -50,7 +50,7 @@ counts them (`tests/runtime_test.py`). An encoder's size decides what helps it o
 before jax is imported. An encoder that is not listed, a user's own, counts as the largest."""
 
 _YNN = "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT,LIBRARY_FUSION_TYPE_REDUCE"
-XLA_FLAGS = {"0.10": (_YNN,), "0.12": (_YNN,)}
+XLA_FLAGS = {"0.10": (_YNN,), "0.11": (_YNN,), "0.12": (_YNN,)}
 """{jaxlib's version, without what follows the second number: flags}: products and reductions by the YNNPACK
 library. XLA ends a process whose flags it does not know, so a version that is not listed gets none."""
 FLAGS_FROM = 4.0

@@ -19,12 +19,12 @@ from absl import flags
 from srl_jax import display, envs
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.resuming import all_to_resume, blank, going_on, is_run, say_anew
 from srl_jax.rundir import check_free, run_directory
 from srl_jax.training import check_game, resolved
 
 from . import flags as config_flags
 from . import runtime
-from .directories import all_to_resume, check_out, going_on, say_anew
 from .stopping import signals
 
 FLAGS = flags.FLAGS
@@ -53,6 +53,55 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_boolean(
         "print_config", False, "print the resolved config as JSON and exit", flag_values=values
     )
+
+
+def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:
+    """Whether a run can be written there; writes nothing.
+
+    Args:
+        out: the path, or None where it was not given.
+        config: what it starts from must not be deleted.
+        overwrite: a run that lies there may be deleted.
+        resume: whether a run that lies there will be resumed.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if not out:
+        raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
+    if overwrite and resume:
+        raise ConfigError("--resume=auto: resumes the run that --overwrite deletes; give one of them")
+    path = config_flags.check_place("out", out)
+    try:
+        if blank(path):
+            return path
+        if resume:
+            if not is_run(path):
+                raise ConfigError(f"--out={out}: not a run directory, so --resume=auto cannot resume it")
+            return path
+        if not overwrite:
+            raise ConfigError(
+                f"--out={out}: not empty; name a new directory, or --resume=auto resumes the run, "
+                "or --overwrite deletes it"
+            )
+        if path.is_symlink():
+            raise ConfigError(
+                f"--out={out}: a link, so --overwrite does not delete it; name what it leads to"
+            )
+        if not is_run(path):
+            raise ConfigError(f"--out={out}: not a run directory, so --overwrite does not delete it")
+    except OSError as error:
+        raise ConfigError(f"--out={out}: {error.strerror}") from None
+    for flag in SOURCES:
+        source = getattr(config, flag)
+        if source and Path(source).resolve().is_relative_to(path.resolve()):
+            raise ConfigError(f"--out={out}: --overwrite would delete --{flag}={source}")
+    if Path.cwd().is_relative_to(path.resolve()):
+        raise ConfigError(f"--out={out}: --overwrite would delete the working directory")
+    return path
 
 
 def check_seeds(values: flags.FlagValues) -> list[int]:

@@ -264,7 +264,7 @@ def read_manifest(path: str | Path) -> Manifest:
     if about["format"] != FORMAT:
         raise ConfigError(f"{path}: checkpoint of format {about['format']}, not {FORMAT}")
     try:
-        config = Config.from_json(json.dumps(about["config"]))
+        config = Config.from_values(about["config"])
     except ConfigError as error:  # of another version
         raise ConfigError(f"{path / MANIFEST}: {error}") from None
     counts = {name: about[name] for name in ("num_actions", "env_steps", "updates")}

@@ -214,7 +214,8 @@ def _rows(run):
 def test_training_restarts_once_and_learns_the_same(tmp_path):
     small = [
         "--game=Catch", "--frame_size=42", "--encoder=tiny", "--mode=pretrain", "--objective=latent_l2",
-        "--num_envs=4", "--batch_size=4", "--learn_start=8", "--steps=40", "--log_every=20", "--nodiagnostics",
+        "--num_envs=4", "--batch_size=4", "--learn_start=8", "--steps=40", "--log_every=20",
+        "--nodiagnostics",
     ]  # fmt: skip
     present = {name: value for name, value in os.environ.items() if name not in (*AT_START, runtime.GUARD)}
     done = subprocess.run(

@@ -19,8 +19,8 @@ from typing import Any
 
 from absl import flags
 
-from srl_jax.config import git_revision, versions
 from srl_jax.errors import ConfigError
+from srl_jax.provenance import git_revision, versions
 from srl_jax.specs import choices_text
 
 from .. import flags as config_flags

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from srl_jax.config import versions
 from srl_jax.errors import ConfigError
+from srl_jax.provenance import versions
 from srl_jax.specs import Info
 
 from .. import flags as config_flags

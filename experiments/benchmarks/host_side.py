@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from srl_jax.config import versions
+from srl_jax.provenance import versions
 
 from .. import runtime
 from .worker import serve

@@ -13,7 +13,8 @@ from unittest import mock
 
 import numpy as np
 
-from srl_jax.config import Config, resolve, versions
+from srl_jax.config import Config, resolve
+from srl_jax.provenance import versions
 from srl_jax.types import TrainState, Window
 
 from .. import runtime

@@ -15,7 +15,7 @@ from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
 from .. import collect, diagnostic_plots, plots
 from ..collect import RunData
-from ..directories import natural
+from ..run_data import natural
 from . import diagnostics, numbers, pictures
 from .contents import Content, Report, run_name
 from .markup import Markup, breakable, details, figure, listed, plural, tag

@@ -18,8 +18,8 @@ from srl_jax.specs import LIMITS
 
 from .. import collect
 from ..collect import RunData, has_policy
-from ..directories import natural
 from ..presets import PRESETS
+from ..run_data import natural
 from . import configs
 
 NEVER = 1e18

@@ -11,14 +11,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax import checkpoint, rundir
+from srl_jax import checkpoint, resuming, rundir
 from srl_jax.checkpoint import NUMBERS, PARAMS
 from srl_jax.config import INFOS, Config, another_run, difference
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import Mark
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 
-from .. import directories
 from . import manifest as manifests
 
 
@@ -71,7 +70,7 @@ def look(path: Path, config: Config) -> State:
         ConfigError: a run of another configuration lies there, or one that this version cannot read.
     """
     try:
-        blank = directories.blank(path)
+        blank = resuming.blank(path)
         problem = "" if blank else _config_problem(path, config)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
@@ -165,7 +164,7 @@ def _broken(path: Path, config: Config) -> str:
     try:
         found = checkpoint.newest_good(path, lambda line: None)
         if found is None:
-            if (steps := directories.reached(path)) >= directories.first_checkpoint(config):
+            if (steps := resuming.reached(path)) >= resuming.first_checkpoint(config):
                 return f"got to {steps} env steps, and there is no checkpoint"
             return ""
         if differing := another_run(found.config, config):
