@@ -53,6 +53,12 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_boolean(
         "print_config", False, "print the resolved config as JSON and exit", flag_values=values
     )
+    flags.DEFINE_boolean(
+        "dry_run",
+        False,
+        "check everything, print the resolved config as JSON, say where the run would be written, and exit",
+        flag_values=values,
+    )
 
 
 def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:
@@ -189,7 +195,8 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     check_extras(config)
     if not resume:
         check_paths(config)
-    if prepare is not None:
+    dry = values["dry_run"].value
+    if prepare is not None and not dry:
         prepare(values["tune_runtime"].value, config.encoder)
     runtime.check_device()
     config = resolved(config)
@@ -207,6 +214,12 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     check_paths(needed)
     checkpoint.check_sources(needed)
     config_flags.say_what_is_replaced(values)
+    if dry:
+        display.result(config.to_json())
+        for (directory, _), manifest in zip(runs, manifests, strict=True):
+            how = f"would resume from {manifest.env_steps} env steps" if manifest else "would begin"
+            display.say(f"dry run: nothing is written; a run {how} in {directory}")
+        return 0
     if not resume and not values["overwrite"].value:
         for directory, _ in runs:
             say_anew(directory)

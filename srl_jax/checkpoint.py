@@ -193,34 +193,26 @@ def _put_in_place(temporary: Path, final: Path) -> None:
 
 
 def slim(manifest: Manifest) -> Manifest:
-    """Rewrites a checkpoint from which nobody will go on: what `State` brought in is removed.
+    """Rewrites a checkpoint from which nobody will resume: what `State` brought in is removed.
 
     Raises:
         SaveError: it could not be written; the checkpoint is whole, as it was or slim.
     """
-    final = manifest.path
-    temporary = final.parent / f".{final.name}.partial"
-    slimmed = manifest._replace(files={PARAMS: manifest.files[PARAMS]})
-    try:
-        temporary.mkdir()
-        if not _link(manifest, PARAMS, temporary):
-            shutil.copyfile(final / PARAMS, temporary / PARAMS)
-        sign(temporary, _about(slimmed))
-        _put_in_place(temporary, final)
-    except OSError as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise SaveError(f"{final}: not rewritten: {error.strerror or error}") from error
-    return slimmed
+    folder = manifest.path.parent
+    about = manifest._asdict()
+    del about["path"], about["files"]
+    return save(folder.parent, load(manifest), **about, keep=0, folder=folder.name)
 
 
 def sign(folder: Path, about: Mapping[str, Any]) -> None:
     """Writes a manifest and its sum."""
-    entry = write(folder / MANIFEST, json.dumps(dict(about), indent=1).encode())
-    write(folder / CHECKSUM, _sum_line(entry.sha256))
+    data = json.dumps(dict(about), indent=1).encode()
+    write(folder / MANIFEST, data)
+    write(folder / CHECKSUM, _sum_line(data))
 
 
-def _sum_line(digest: str) -> bytes:
-    return f"{digest}  {MANIFEST}\n".encode()
+def _sum_line(data: bytes) -> bytes:
+    return f"{_sha256(data)}  {MANIFEST}\n".encode()
 
 
 def write(path: Path, *pieces: bytes | memoryview) -> Entry:
@@ -258,7 +250,7 @@ def read_manifest(path: str | Path) -> Manifest:
     if path == given and not any(os.path.lexists(path / name) for name in (MANIFEST, CHECKSUM)):
         raise ConfigError(f"{path}: no checkpoint there; name a run directory or one of its checkpoints")
     data = _read(path / MANIFEST)
-    if _read(path / CHECKSUM) != _sum_line(_sha256(data)):
+    if _read(path / CHECKSUM) != _sum_line(data):
         raise ConfigError(f"{path / MANIFEST}: damaged: its sha256 is not the one in {CHECKSUM}")
     about = json.loads(data)
     if about["format"] != FORMAT:
@@ -359,17 +351,17 @@ class Arrays(Mapping):
 
     def __init__(self, manifest: Manifest, prefix: str):
         self._manifest, self._prefix = manifest, prefix
-        names = [Path(file).stem for file in manifest.files if file.endswith(".npy")]
-        self._names = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        names = (Path(file).stem for file in manifest.files if file.endswith(".npy"))
+        self._names = {name.removeprefix(prefix): name for name in names if name.startswith(prefix)}
 
     def __getitem__(self, name: str) -> np.ndarray:
         return load_array(self._manifest, self._prefix + name)
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
     def __contains__(self, name: object) -> bool:
         return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
 
     def __len__(self) -> int:
         return len(self._names)
@@ -429,15 +421,8 @@ def _flat(tree: dict[str, Any]) -> dict[str, Any]:
     return traverse_util.flatten_dict(tree, keep_empty_nodes=True, sep="/")
 
 
-_SAME = {
-    "encoder_from": {
-        "encoder": "architecture",
-        "frame_size": "preprocessing",
-        "frame_stack": "preprocessing",
-    },
-    "policy_from": {"game": "game", "frame_size": "preprocessing", "frame_stack": "preprocessing"},
-}
-"""What a run must have in common with the one that a flag names."""
+_SAME = {"encoder_from": "encoder", "policy_from": "game"}
+"""What a run must have in common with the one that a flag names, beside how frames are made."""
 
 
 def check_sources(config: Config) -> None:
@@ -446,7 +431,7 @@ def check_sources(config: Config) -> None:
     Raises:
         ConfigError: one line that names the flag and what differs.
     """
-    for flag, fields in _SAME.items():
+    for flag, own in _SAME.items():
         if not (path := getattr(config, flag)):
             continue
         try:
@@ -457,7 +442,8 @@ def check_sources(config: Config) -> None:
             raise ConfigError(
                 f"--{flag}={path}: a representation run has no policy; name a run of another mode"
             )
-        for field, what in fields.items():
+        for field in (own, "frame_size", "frame_stack"):
+            what = {"encoder": "architecture", "game": "game"}.get(field, "preprocessing")
             ours, theirs = getattr(config, field), getattr(found, field)
             if ours != theirs:
                 raise ConfigError(

@@ -186,7 +186,8 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
     at_most = None
     while True:
         found = [to_resume(path, wanted, at_most) for path, wanted in runs]
-        if None in found:
+        steps = [manifest.env_steps for manifest in found if manifest is not None]
+        if len(steps) < len(runs):
             first, wanted = runs[found.index(None)]
             for (path, _), manifest in zip(runs, found, strict=True):
                 never = not (first / config.FILE).exists()
@@ -196,8 +197,7 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
                         f"{manifest.env_steps} env steps; --overwrite would start all of them anew"
                     )
             return [None] * len(runs)
-        steps = {manifest.env_steps for manifest in found}
-        if len(steps) == 1:
+        if len(set(steps)) == 1:
             return found
         at_most = min(steps)
 

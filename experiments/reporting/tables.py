@@ -16,6 +16,7 @@ from srl_jax.data import (
 )
 from srl_jax.statistics import NARROW, Interval
 
+from .. import collect
 from . import numbers
 from .contents import Content, Report, limits, side, signed
 from .markup import Markup, details, number, plural, table, tag
@@ -88,7 +89,7 @@ def _of_game(report: Report, game: str, comparison: Comparison) -> list:
     for name, policy in reference_policies(game).items():
         cell = _policy(policy)
         body.append([f"{name} policy", "–", cell, "–", cell, "–"] + (["–"] if score is not None else []))
-        if differs := policy.differs_from(config):
+        if differs := collect.differs(policy, config):
             notes.append(f"Of the {name} policy differs: {differs}. ")
     if (cut := comparison.cut_by) is not None:
         state = "ended" if numbers.finished(cut) else "has got to and is not finished"
@@ -207,7 +208,7 @@ def _published(report: Report, game: str, comparison: Comparison) -> list:
     def cells(result: Published) -> list:
         spread = f" ± {number(result.spread)}" if result.spread is not None else ""
         steps = "–" if result.env_steps is None else f"{result.env_steps:,}"
-        differs = result.differs_from(config, end, seeds)
+        differs = collect.differs(result, config, end, seeds)
         return [result.method, number(result.score) + spread, steps, differs, result.protocol, result.source]
 
     near = [x for x in results if x.env_steps is None or end / NEAR <= x.env_steps <= NEAR * end]
