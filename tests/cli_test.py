@@ -1,5 +1,6 @@
 """Tests of the command line: experiments.flags and experiments.train."""
 
+import importlib
 import json
 import os
 import pathlib
@@ -19,7 +20,7 @@ from experiments import resume, train
 from experiments.presets import PRESETS
 from srl_jax import checkpoint, rundir
 from srl_jax.config import INFOS, Config
-from srl_jax.errors import ConfigError
+from srl_jax.errors import EXIT_STATUS, ConfigError, Diverged, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from tests.helpers import SMALL
 
@@ -85,8 +86,9 @@ def _config(*arguments):
     return config_flags.config_from_flags(_parse(arguments), complete=False)
 
 
-def _python(*arguments):
-    return subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True, timeout=60)
+def _python(*arguments, **env):
+    options = {"cwd": ROOT, "env": os.environ | env, "capture_output": True, "text": True, "timeout": 60}
+    return subprocess.run([sys.executable, *arguments], **options)
 
 
 def test_every_field_is_a_flag_with_help_and_its_default():
@@ -269,23 +271,23 @@ def test_a_later_flag_of_a_name_replaces_an_earlier_one():
 @pytest.mark.parametrize(
     ("program", "flag", "hint"),
     [
-        ("draw", "run", "give it once"),
         ("evaluate", "games", "give it once"),
         ("report", "out", "give it once"),
         ("sweep", "lr_rl", "give it once"),
         ("sweep", "presets", "separate values with commas"),
         ("figures", "games", "separate values with commas"),
         ("reference_policies", "games", "separate values with commas"),
-        ("soaking", "only", "separate values with commas"),
         ("benchmarks.bench", "rounds", "give it once"),
     ],
 )
-def test_a_flag_that_means_one_value_is_refused_twice(program, flag, hint):
-    # A process each: that entry points parse in one place is the point.
+def test_a_flag_that_means_one_value_is_refused_twice(program, flag, hint, capsys):
+    values = flags.FlagValues()
+    importlib.import_module(f"experiments.{program}").define_flags(values)
     value = "Catch" if flag == "games" and program != "evaluate" else "1"
-    done = _python("-m", f"experiments.{program}", f"--{flag}={value}", f"--{flag}={value}")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == f"error: --{flag}: given 2 times; {hint}\n"
+    with pytest.raises(SystemExit) as ended:
+        config_flags.parse([program, f"--{flag}={value}", f"--{flag}={value}"], values)
+    assert ended.value.code == 2
+    assert capsys.readouterr() == ("", f"error: --{flag}: given 2 times; {hint}\n")
 
 
 def _refused(capsys, *arguments):
@@ -536,16 +538,15 @@ def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkey
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
 
 
-@pytest.mark.parametrize(("error", "status"), [("ConfigError", 2), ("SaveError", 3), ("Diverged", 4)])
-def test_errors_are_one_line_and_have_a_status_of_their_own(error, status):
-    code = (
-        "from experiments import flags; from srl_jax import errors\n"
-        "def main(argv):\n"
-        f"    raise errors.{error}('two\\n lines')\n"
-        "flags.run(main)"
-    )
-    done = _python("-c", code)
-    assert (done.returncode, done.stdout, done.stderr) == (status, "", "error: two lines\n")
+@pytest.mark.parametrize("error", EXIT_STATUS)
+def test_errors_are_one_line_and_have_a_status_of_their_own(error, capsys):
+    def main(argv):
+        raise error("two\n lines")
+
+    with pytest.raises(SystemExit) as ended:
+        config_flags.guarded(main)(["program"])
+    assert ended.value.code == {ConfigError: 2, SaveError: 3, Diverged: 4}[error]
+    assert capsys.readouterr() == ("", "error: two lines\n")
 
 
 def test_resume_needs_nothing_but_the_directory(loop, tmp_path, monkeypatch):
@@ -573,18 +574,15 @@ def test_resume_refuses_what_is_no_run(tmp_path):
     (tmp_path / "sweep.json").touch()
     with pytest.raises(ConfigError, match="a sweep, which srl-jax sweep --out="):
         resume.command_line(str(tmp_path))
-    done = _python("-m", "experiments.resume")
-    assert (done.returncode, done.stderr) == (
-        2,
-        "error: name a run directory first: srl-jax resume runs/NAME\n",
-    )
+    with pytest.raises(ConfigError, match="^name a run directory first: srl-jax resume runs/NAME$"):
+        resume.main(["resume"])
 
 
-SHORT = SMALL | {"steps": 1200, "eval_every": 400}
+SHORT = SMALL | {"steps": 600, "eval_every": 200}
 RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=off"]
 
 
-def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
+def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys):
     from srl_jax import loop
 
     out, command = tmp_path / "run", [sys.executable, "-m", "experiments.train", *RUN]
@@ -602,18 +600,17 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path):
     printed, _ = first.communicate(timeout=60)
     assert first.returncode == 128 + signal.SIGTERM
     stopped = checkpoint.read_manifest(out).env_steps
-    assert 80 <= stopped < 1200
+    assert 80 <= stopped < 600
     line = f"stopped after {stopped} env steps; srl-jax resume {out} resumes from there"
     assert line in printed.splitlines()
 
-    done = _python("-m", "srl_jax", "resume", str(out), "--tune_runtime=off")
-    assert done.returncode == 0, done.stderr
-    assert f"1200 env steps, 145 updates; everything is in {out}" in done.stdout
+    assert _train(*resume.command_line(str(out)), "--tune_runtime=off") == 0
+    assert f"600 env steps, 70 updates; everything is in {out}" in capsys.readouterr().out
     whole = tmp_path / "whole"
     whole.mkdir()
     loop.train(Config.load(out), whole, progress=False)
     rows = [[strip_wall(row) for row in read_metrics(path / "metrics.jsonl")] for path in (out, whole)]
-    assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 1200
+    assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 600
     assert checkpoint.read_manifest(out).files == checkpoint.read_manifest(whole).files
 
 
@@ -641,31 +638,34 @@ def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):
     assert "--tensorboard" in _refused(capsys, "--tensorboard", f"--out={tmp_path}/a")
 
 
-@pytest.mark.parametrize("preset", PRESETS)
-def test_print_config_shows_every_preset(preset, capsys, loop):
+def test_a_dry_run_says_what_would_be_done_and_writes_nothing(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    assert _train(*CATCH, "--dry_run", f"--out={out}", "--seeds=3,4") == 0
+    printed = capsys.readouterr()
+    config = Config.from_json(printed.out)
+    assert config.steps == 500 and "n_step=3" in config.rl
+    assert printed.err == "".join(
+        f"dry run: nothing is written; a run would begin in {out}/seed{seed}\n" for seed in (3, 4)
+    )
+    assert loop.calls == [] and list(tmp_path.iterdir()) == []
+    _train(*CATCH, f"--out={out}")
+    _checkpoint(out, 200)
+    capsys.readouterr()
+    before = sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*"))
+    assert _train(*CATCH, "--dry_run", f"--out={out}", "--resume=auto") == 0
+    assert f"a run would resume from 200 env steps in {out}\n" in capsys.readouterr().err
+    assert "not empty" in _refused(capsys, *CATCH[1:], "--dry_run", f"--out={out}")
+    assert "no 'rainbwo'" in _refused(capsys, "--rl=rainbwo", "--dry_run", f"--out={tmp_path}/new")
+    assert sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*")) == before and len(loop.calls) == 1
+
+
+@pytest.mark.parametrize("preset", ["demo", "thesis/frozen_256", "catch/joint"])
+def test_print_config_shows_a_preset(preset, capsys, loop):
     _train(f"--preset={preset}", "--print_config", "--seed=3")
     config = Config.from_json(capsys.readouterr().out)
     assert config.seed == 3
     assert config.mode == PRESETS[preset]["mode"]
     assert loop.calls == []
-
-
-def test_the_entry_point_refuses_a_game_in_one_line(tmp_path):
-    done = _python("-m", "experiments.train", "--game=Pogn", f"--out={tmp_path}/a")
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: --game=Pogn: did you mean Pong? valid: an Atari-57 game (")
-    assert done.stderr.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
-
-
-def test_the_entry_point_refuses_an_option_in_one_line(tmp_path):
-    # It takes jax to find this one, so a restart would come first.
-    arguments = ["--rl=rainbow:v_min=20", "--tune_runtime=off", f"--out={tmp_path}/a"]
-    done = _python("-m", "experiments.train", *arguments)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("error: --rl=rainbow:v_min=20")
-    assert done.stderr.count("\n") == 1
-    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("error", [AssertionError(), RuntimeError("Unable to initialize\nmore")])
@@ -686,30 +686,12 @@ def test_a_device_that_is_not_there_is_refused_before_anything_is_written(
 
 
 def test_the_entry_point_refuses_a_device_in_one_line(tmp_path):
-    done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "experiments.train",
-            "--game=Catch",
-            "--tune_runtime=off",
-            f"--out={tmp_path}/a",
-        ],
-        cwd=ROOT,
-        env={**os.environ, "JAX_PLATFORMS": "nonsense"},
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
+    # A process: jax itself finds none, and neither jax nor absl says anything beside our line.
+    arguments = ["--game=Catch", "--tune_runtime=off", f"--out={tmp_path}/a"]
+    done = _python("-m", "experiments.train", *arguments, JAX_PLATFORMS="nonsense")
     assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: JAX_PLATFORMS=nonsense: jax finds no such device (")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_entry_point_prints_its_config():
-    done = _python("-m", "experiments.train", "--preset=thesis/joint_256", "--print_config")
-    assert (done.returncode, done.stderr) == (0, "")
-    assert Config.from_json(done.stdout).encoder.startswith("sac_ae:features=256,")
 
 
 def test_nothing_that_is_checked_first_imports_jax():
