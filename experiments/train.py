@@ -21,7 +21,7 @@ from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.resuming import all_to_resume, blank, going_on, is_run, say_anew
 from srl_jax.rundir import check_free, run_directory
-from srl_jax.training import check_game, resolved
+from srl_jax.training import check_game, check_sources, resolved
 
 from . import flags as config_flags
 from . import runtime
@@ -82,32 +82,30 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
         raise ConfigError("--resume=auto: resumes the run that --overwrite deletes; give one of them")
     path = config_flags.check_place("out", out)
     try:
-        if blank(path):
-            return path
-        if resume:
-            if not is_run(path):
-                raise ConfigError(f"--out={out}: not a run directory, so --resume=auto cannot resume it")
-            return path
-        if not overwrite:
-            raise ConfigError(
-                f"--out={out}: not empty; name a new directory, or --resume=auto resumes the run, "
-                "or --overwrite deletes it"
-            )
-        if path.is_symlink():
-            raise ConfigError(
-                f"--out={out}: a link, so --overwrite does not delete it; name what it leads to"
-            )
-        if not is_run(path):
-            raise ConfigError(f"--out={out}: not a run directory, so --overwrite does not delete it")
+        problem = "" if blank(path) else _why_not(path, config, overwrite, resume)
     except OSError as error:
-        raise ConfigError(f"--out={out}: {error.strerror}") from None
+        problem = str(error.strerror)
+    if problem:
+        raise ConfigError(f"--out={out}: {problem}")
+    return path
+
+
+def _why_not(path: Path, config: Config, overwrite: bool, resume: bool) -> str:
+    """Why a directory in which something lies cannot be resumed or deleted; "" where it can."""
+    if resume:
+        return "" if is_run(path) else "not a run directory, so --resume=auto cannot resume it"
+    if not overwrite:
+        return "not empty; name a new directory, or --resume=auto resumes the run, or --overwrite deletes it"
+    if path.is_symlink():
+        return "a link, so --overwrite does not delete it; name what it leads to"
+    if not is_run(path):
+        return "not a run directory, so --overwrite does not delete it"
     for flag in SOURCES:
         source = getattr(config, flag)
         if source and Path(source).resolve().is_relative_to(path.resolve()):
-            raise ConfigError(f"--out={out}: --overwrite would delete --{flag}={source}")
-    if Path.cwd().is_relative_to(path.resolve()):
-        raise ConfigError(f"--out={out}: --overwrite would delete the working directory")
-    return path
+            return f"--overwrite would delete --{flag}={source}"
+    own = Path.cwd().is_relative_to(path.resolve())
+    return "--overwrite would delete the working directory" if own else ""
 
 
 def check_seeds(values: flags.FlagValues) -> list[int]:
@@ -212,7 +210,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     # A checkpoint has the encoder; the policy that others are pretrained on is read again.
     needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
     check_paths(needed)
-    checkpoint.check_sources(needed)
+    check_sources(needed)
     config_flags.say_what_is_replaced(values)
     if dry:
         display.result(config.to_json())

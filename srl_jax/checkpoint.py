@@ -421,36 +421,6 @@ def _flat(tree: dict[str, Any]) -> dict[str, Any]:
     return traverse_util.flatten_dict(tree, keep_empty_nodes=True, sep="/")
 
 
-_SAME = {"encoder_from": "encoder", "policy_from": "game"}
-"""What a run must have in common with the one that a flag names, beside how frames are made."""
-
-
-def check_sources(config: Config) -> None:
-    """Whether the checkpoints that a run wants to start from exist and fit it; reads manifests alone.
-
-    Raises:
-        ConfigError: one line that names the flag and what differs.
-    """
-    for flag, own in _SAME.items():
-        if not (path := getattr(config, flag)):
-            continue
-        try:
-            found = read_manifest(path).config
-        except ConfigError as error:
-            raise ConfigError(f"--{flag}={path}: {error}") from None
-        if flag == "policy_from" and found.mode == "pretrain":
-            raise ConfigError(
-                f"--{flag}={path}: a representation run has no policy; name a run of another mode"
-            )
-        for field in (own, "frame_size", "frame_stack"):
-            what = {"encoder": "architecture", "game": "game"}.get(field, "preprocessing")
-            ours, theirs = getattr(config, field), getattr(found, field)
-            if ours != theirs:
-                raise ConfigError(
-                    f"--{flag}={path}: the {what} differs: {field} is {theirs} there and {ours} here"
-                )
-
-
 def check_frames(manifest: Manifest, frame_shape: tuple, what: str, game: str) -> None:
     """Whether a checkpoint's encoder has seen frames of the shape (H, W, C) that a game shows.
 

@@ -103,7 +103,7 @@ def parsed(run: Planned) -> Config:
 
 
 def check_sources(run: Planned, configs: dict[str, Config]) -> None:
-    """`srl_jax.checkpoint.check_sources` before there are any checkpoints.
+    """`srl_jax.training.check_sources` before there are any checkpoints.
 
     Raises:
         ConfigError: the run cannot start from those that it names.

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from srl_jax.encoders.adapter import flax_encoder
-from srl_jax.layers import INITIALISERS, Conv, ConvTranspose, Dense, WideDense
+from srl_jax.layers import INITIALISERS, Conv, ConvTranspose, Dense, Pads, WideDense
 from srl_jax.specs import choices_text
 from srl_jax.types import Encoder
 
@@ -85,7 +85,7 @@ class EncoderNetwork(nn.Module):
         for i, layer in enumerate(self.layers):
             # The first kernel is multiplied by the gain, not the image: the same, with fewer bytes.
             first = i == 0
-            padding = padding_between(*self.sizes[i : i + 2], layer)
+            padding = padding_between(self.sizes[i], self.sizes[i + 1], layer)
             conv = Conv(*layer, init, zero_sum and first, gain if first else 1.0, padding=padding)
             x = nn.relu(conv(x))
         x = x.reshape(x.shape[0], -1)
@@ -175,17 +175,19 @@ def convolutional_encoder(
     return encoder._replace(steps=tuple(steps(network)))
 
 
-def padding_between(before: Sequence[int], after: Sequence[int], layer: Layer) -> list[tuple[int, int]]:
+def padding_between(before: tuple[int, int], after: tuple[int, int], layer: Layer) -> Pads:
     """The zeros ((above, below), (left, right)) of a layer between two sizes (height, width)."""
-    beyond = zip(before, after, strict=True)
-    return [(0, max(0, (y - 1) * layer.stride + layer.kernel - x)) for x, y in beyond]
+    below, right = (
+        max(0, (y - 1) * layer.stride + layer.kernel - x) for x, y in zip(before, after, strict=True)
+    )
+    return (0, below), (0, right)
 
 
 def steps(network: EncoderNetwork) -> Iterator[dict[str, Any]]:
     """What a network computes of bytes, as `Encoder.steps`."""
     yield {"step": "multiply", "by": network.start.gain / 255}
     for i, layer in enumerate(network.layers):
-        padding = padding_between(*network.sizes[i : i + 2], layer)
+        padding = padding_between(network.sizes[i], network.sizes[i + 1], layer)
         yield {"step": "conv", "parameters": f"Conv_{i}", "stride": layer.stride, "padding": padding}
         yield {"step": "relu"}
     yield {"step": "flatten"}
