@@ -23,7 +23,7 @@ from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import parse_row
 from srl_jax.reading import ROWS as MOST_BYTES
-from srl_jax.reading import parse_json, read_bytes, replace_bytes, replace_text
+from srl_jax.reading import read_bytes, read_json, replace_bytes, replace_text
 
 from . import flags as config_flags
 from .draw import check_rows
@@ -239,12 +239,10 @@ def _place(name: str) -> tuple[int, str]:
 def _entries(folder: Path) -> list[tuple[str, dict[str, Any], Mapping[str, Any]]]:
     """(arm, the content of config.json, the run's entry) of each run in configs.json."""
     path = folder / CONFIGS
+    found = read_json(path, MOST_BYTES)
     try:
-        found = parse_json(read_bytes(path, MOST_BYTES))
         return [(arm["arm"], {**arm["config"], **run["config"]}, run) for arm in found for run in arm["runs"]]
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except (ValueError, TypeError, KeyError) as error:
+    except (TypeError, KeyError) as error:
         raise ConfigError(f"{path}: not what packing writes ({error})") from None
 
 
