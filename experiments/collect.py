@@ -17,7 +17,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 
 from . import packing
-from .run_data import RunData, arm_name, load_run, natural, run_directories
+from .run_data import RunData, arm_name, in_order, load_run, run_directories
 
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
@@ -47,8 +47,7 @@ def load_runs(*roots: str | Path) -> list[RunData]:
     read: list[RunData] = []
     for path in files.values():
         read += packing.read(path.parent) if path.name == packing.CONFIGS else [load_run(path.parent)]
-    runs = _each_once(read)
-    return [runs[key] for key in sorted(runs, key=lambda key: (key[0], natural(key[1]), key[2]))]
+    return in_order(_each_once(read))
 
 
 def load_named(root: Path, names: Iterable[str]) -> list[RunData]:
@@ -65,19 +64,23 @@ def load_named(root: Path, names: Iterable[str]) -> list[RunData]:
     found = [load_run(path) for path in places if (path / "config.json").exists()]
     if packing.is_packed(root):
         found += [run for run in packing.read(root) if run.path in places]
-    return sorted(_each_once(found).values(), key=lambda run: places.index(run.path))
+    return sorted(_each_once(found), key=lambda run: places.index(run.path))
 
 
-def _each_once(runs: Iterable[RunData]) -> dict[tuple, RunData]:
-    """{(game, arm, seed): the run}."""
+def _each_once(runs: Sequence[RunData]) -> Sequence[RunData]:
+    """The runs.
+
+    Raises:
+        ConfigError: two are of the same game, arm and seed.
+    """
     found: dict[tuple, RunData] = {}
     for run in runs:
-        other = found.setdefault((run.game, run.arm, run.seed), run)
+        other = found.setdefault(run.key, run)
         if other is not run:
             raise ConfigError(
                 f"{run.path}: the same game, arm and seed as {other.path}; move one of them away"
             )
-    return found
+    return runs
 
 
 def arm_names(root: Path) -> list[str]:

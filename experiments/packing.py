@@ -17,6 +17,7 @@ from typing import Any
 
 from absl import flags
 
+from srl_jax import config as config_file
 from srl_jax import display, ending
 from srl_jax.config import INFOS, Config
 from srl_jax.ending import Ending
@@ -27,7 +28,7 @@ from srl_jax.reading import read_bytes, read_json, replace_bytes, replace_text
 
 from . import flags as config_flags
 from .draw import check_rows
-from .run_data import RunData, load_run, natural, run_directories, runs_below
+from .run_data import RunData, in_order, load_run, run_directories, runs_below
 
 FLAGS = flags.FLAGS
 
@@ -108,12 +109,12 @@ def write(folder: Path, runs: Iterable[RunData]) -> None:
         ConfigError: a row has a key that packing needs.
         OSError: a file could not be written.
     """
-    runs = _sorted(runs)
+    runs = in_order(runs)
     lines = []
     for run in runs:
         if clash := next((key for row in run.rows for key in KEYS if key in row), None):
             raise ConfigError(f"{run.path}: its rows have a key {clash!r}, which packing needs")
-        key = dict(zip(KEYS, _key(run), strict=True))
+        key = dict(zip(KEYS, run.key, strict=True))
         lines += [json.dumps({**key, **row}, allow_nan=False) + "\n" for row in run.rows]
     groups: dict[tuple, list[RunData]] = {}
     for run in runs:
@@ -130,13 +131,13 @@ def added(here: Sequence[RunData], more: Iterable[RunData]) -> list[RunData]:
     Raises:
         ConfigError: one of the others has the game, arm and seed of a run that has other rows or settings.
     """
-    runs = {_key(run): run for run in here}
+    runs = {run.key: run for run in here}
     for run in more:
-        there = runs.setdefault(_key(run), run)
+        there = runs.setdefault(run.key, run)
         for what, same in (("rows", there.rows == run.rows), ("settings", there.config == run.config)):
             if not same:
                 raise ConfigError(
-                    f"{run.path}: {_name(*_key(run))} is there with other {what}, from {there.path}; "
+                    f"{run.path}: {_name(*run.key)} is there with other {what}, from {there.path}; "
                     "pack it into another folder"
                 )
     return list(runs.values())
@@ -188,7 +189,7 @@ def unpack(folder: Path, root: Path) -> int:
         raise ConfigError(f"{there}: a run is there; name another directory")
     for path, run in runs.items():
         path.mkdir(parents=True, exist_ok=True)
-        replace_text(path / "config.json", json.dumps(run.about, indent=2) + "\n")
+        config_file.write(path, run.about)
         replace_text(path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in run.rows))
         if run.ended is not None:
             ending.write(path, run.ended)
@@ -200,16 +201,8 @@ def _is_over(run: RunData) -> bool:
     return run.ended is not None or bool(run.rows) and run.rows[-1]["env_steps"] >= run.config.steps
 
 
-def _key(run: RunData) -> tuple[str, str, int]:
-    return run.game, run.arm, run.seed
-
-
 def _name(game: str, arm: str, seed: int) -> str:
     return f"{game}, {arm}, seed {seed}"
-
-
-def _sorted(runs: Iterable[RunData]) -> list[RunData]:
-    return sorted(runs, key=lambda run: (run.game, natural(run.arm), run.seed))
 
 
 def _arm(folder: Path, runs: Sequence[RunData]) -> dict[str, Any]:

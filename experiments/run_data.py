@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -37,9 +37,19 @@ class RunData(NamedTuple):
     about: Mapping[str, Any] = MappingProxyType({})
 
     @property
+    def key(self) -> tuple[str, str, int]:
+        """What it is a run of: (game, arm, seed)."""
+        return self.game, self.arm, self.seed
+
+    @property
     def failed(self) -> bool:
         """Whether it ended with an error, and is not under way."""
         return self.ended is not None and self.ended.failed
+
+
+def in_order(runs: Iterable[RunData]) -> list[RunData]:
+    """Runs by game, arm and seed."""
+    return sorted(runs, key=lambda run: (run.game, natural(run.arm), run.seed))
 
 
 def arm_name(path: Path) -> str:

@@ -17,7 +17,6 @@ import hashlib
 import io
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -212,7 +211,7 @@ def sign(folder: Path, about: Mapping[str, Any]) -> None:
 
 
 def _sum_line(data: bytes) -> bytes:
-    return f"{_sha256(data)}  {MANIFEST}\n".encode()
+    return f"{hashlib.sha256(data).hexdigest()}  {MANIFEST}\n".encode()
 
 
 def write(path: Path, *pieces: bytes | memoryview) -> Entry:
@@ -225,10 +224,6 @@ def write(path: Path, *pieces: bytes | memoryview) -> Entry:
         file.flush()
         os.fsync(file.fileno())
     return Entry(sum(memoryview(piece).nbytes for piece in pieces), digest.hexdigest())
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
 
 
 # Reading
@@ -377,7 +372,7 @@ def _checked(manifest: Manifest, file: str) -> bytes:
     """A file's content, if it has the sum that the manifest says."""
     path, entry = _entry(manifest, file)
     data = _read(path)
-    if _sha256(data) != entry.sha256:
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise ConfigError(f"{path}: damaged: its sha256 is not the manifest's")
     return data
 
@@ -441,7 +436,7 @@ def _all(folder: Path) -> list[Path]:
     """The checkpoints of a folder, oldest first; whether they are whole, their manifests tell."""
     if not os.path.isdir(folder):
         return []
-    found = [p for p in folder.glob("[0-9]*") if re.fullmatch("[0-9]+", p.name) and p.is_dir()]
+    found = [p for p in folder.glob("[0-9]*") if p.name.isdecimal() and p.is_dir()]
     return sorted(found, key=lambda p: int(p.name))  # names have 9 digits, but more from a billion steps on
 
 

@@ -112,6 +112,16 @@ def to_resume(path: Path, wanted: Config, at_most: int | None = None) -> Manifes
         raise ConfigError(
             f"--steps={wanted.steps}: the run in {path} has done {manifest.env_steps} env steps already"
         )
+    _say_changes(path, there, about, wanted)
+    return manifest
+
+
+def _say_changes(path: Path, there: Config, about: dict, wanted: Config) -> None:
+    """Says what is different from when the run in a directory began, or was last resumed.
+
+    Raises:
+        ConfigError: what config.json says of versions is not what training writes.
+    """
     if wanted.steps != there.steps:
         say(f"{path}: --steps was {there.steps} and is {wanted.steps}{_by_the_end(wanted)}")
     with contextlib.suppress(ConfigError):  # it informs and decides nothing
@@ -127,7 +137,6 @@ def to_resume(path: Path, wanted: Config, at_most: int | None = None) -> Manifes
             f"{name} was {then!r:.200} and is {now!r:.200}" for name, (then, now) in changed.items()
         )
         say(f"{path}: {what}: results may differ from those of a run that did not end")
-    return manifest
 
 
 def _by_the_end(wanted: Config) -> str:
