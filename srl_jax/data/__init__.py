@@ -4,6 +4,7 @@ import csv
 import functools
 import importlib.resources
 import io
+import typing
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple, TypeVar
 
@@ -175,24 +176,16 @@ _Record = TypeVar("_Record", Published, ReferencePolicy)
 
 
 def _record(kind: type[_Record], row: Mapping[str, str]) -> _Record:
-    """A row of a table as a named tuple; an empty field is None."""
-    return kind._make(_KINDS.get(name, str)(row[name]) if row.get(name) else None for name in kind._fields)
+    """A row of a table as a named tuple, each field of the type that it is declared with; empty is None."""
+    hints = typing.get_type_hints(kind)
+    values = []
+    for name in kind._fields:
+        types = typing.get_args(hints[name]) or (hints[name],)
+        read = int if int in types else float if float in types else str
+        values.append(read(row[name]) if row.get(name) else None)
+    return kind._make(values)
 
 
-_KINDS: dict[str, type[int | float]] = {
-    "env_steps": int,
-    "score": float,
-    "spread": float,
-    "seeds": int,
-    "sticky_actions": float,
-    "epsilon": float,
-    "return_mean": float,
-    "return_std": float,
-    "episodes": int,
-    "length_mean": float,
-    "noop_max": int,
-    "eval_max_steps": int,
-}
 _DQN_ZOO = "google-deepmind/dqn_zoo dqn_zoo/atari_data.py"
 _NO_OPS = "mean of at least 3 games of at most 108,000 frames, after up to 30 no-ops"
 
