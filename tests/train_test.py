@@ -300,7 +300,7 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys
     with pytest.raises(ConfigError, match=f"process {first.pid} on"):
         rundir.check_free(out)
     first.send_signal(signal.SIGTERM)
-    printed, _ = first.communicate(timeout=60)
+    printed, _ = first.communicate(timeout=120)
     assert first.returncode == 128 + signal.SIGTERM
     stopped = checkpoint.read_manifest(out).env_steps
     assert 80 <= stopped < 600
