@@ -240,6 +240,7 @@ def _train(*arguments):
 
 def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path, fresh, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "draw", lambda *_: None)  # figures have tests of their own
     (tmp_path / "mine.py").write_text(MINE)
     assert _train("--import=mine", *FLAGS, "--out=run") == 0
     run = tmp_path / "run"

@@ -285,7 +285,7 @@ SHORT = SMALL | {"steps": 600, "eval_every": 200}
 RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=off"]
 
 
-def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys):
+def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys, monkeypatch):
     from srl_jax import loop
 
     out, command = tmp_path / "run", [sys.executable, "-m", "experiments.train", *RUN]
@@ -307,6 +307,7 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys
     line = f"stopped after {stopped} env steps; srl-jax resume {out} resumes from there"
     assert line in printed.splitlines()
 
+    monkeypatch.setattr(train, "draw", lambda *_: None)  # figures have tests of their own
     assert train_in_process(*resume.command_line(str(out)), "--tune_runtime=off") == 0
     assert f"600 env steps, 70 updates; everything is in {out}" in capsys.readouterr().out
     whole = tmp_path / "whole"
