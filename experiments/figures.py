@@ -121,7 +121,7 @@ def evaluated(
             entry["arms"][name] = values
         config = next(iter(members.values()))[0].config
         entry["policies"] = {
-            name: {"mean": row.return_mean, "differs": row.differs_from(config), "source": row.source}
+            name: {"mean": row.return_mean, "differs": collect.differs(row, config), "source": row.source}
             for name, row in reference_policies(game).items()
         }
         entry["published"] = [level._asdict() for level in published_levels(game, methods, config, until)]
@@ -161,7 +161,7 @@ def published_levels(game: str, methods: Sequence[str], config: Config, until: i
         found = [entry for entry in published(game) if entry.method == method]
         if found:
             entry = min(found, key=lambda entry: abs((entry.env_steps or 0) - until))
-            levels.append(plots.Level(method, entry.score, entry.differs_from(config, until)))
+            levels.append(plots.Level(method, entry.score, collect.differs(entry, config, until)))
     return levels
 
 

@@ -254,23 +254,18 @@ def check_place(flag: str, text: str) -> Path:
     Raises:
         ConfigError: neither holds.
     """
-    check_name(flag, text)
-    path = Path(os.path.expanduser(text))
-    try:
+
+    def problem(path: Path) -> str:
         if path.is_dir():
-            if not os.access(path, os.W_OK | os.X_OK):
-                raise ConfigError(f"--{flag}={text}: no permission to write there")
-            return path
+            return "" if os.access(path, os.W_OK | os.X_OK) else "no permission to write there"
         if os.path.lexists(path):
-            raise ConfigError(f"--{flag}={text}: exists and is not a directory")
+            return "exists and is not a directory"
         parent = next(p for p in path.absolute().parents if os.path.lexists(p))
         if not parent.is_dir():
-            raise ConfigError(f"--{flag}={text}: {parent} is not a directory")
-        if not os.access(parent, os.W_OK | os.X_OK):
-            raise ConfigError(f"--{flag}={text}: no permission to write in {parent}")
-    except OSError as error:
-        raise ConfigError(f"--{flag}={text}: {error.strerror}") from None
-    return path
+            return f"{parent} is not a directory"
+        return "" if os.access(parent, os.W_OK | os.X_OK) else f"no permission to write in {parent}"
+
+    return _checked(flag, text, problem)
 
 
 def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = None) -> Path:
@@ -285,23 +280,34 @@ def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = No
     Raises:
         ConfigError: it has another name, or something lies there, or the directory does not.
     """
-    path = Path(os.path.expanduser(text))
-    if path.suffix.lower() != suffix:
-        raise ConfigError(f"--{flag}={text}: must end in {suffix}")
-    check_name(flag, text)
-    try:
-        there = os.path.lexists(path)
-        if there and not overwrite:
+
+    def problem(path: Path) -> str:
+        if path.suffix.lower() != suffix:
+            return f"must end in {suffix}"
+        if (there := os.path.lexists(path)) and not overwrite:
             hint = "" if overwrite is None else ", or --overwrite replaces it"
-            raise ConfigError(f"--{flag}={text}: exists; name a new file{hint}")
+            return f"exists; name a new file{hint}"
         if there and not path.is_file():
-            raise ConfigError(f"--{flag}={text}: exists and is not a file")
-        if not path.absolute().parent.is_dir():
-            raise ConfigError(f"--{flag}={text}: no such directory")
-    except (OSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"--{flag}={text}: {getattr(error, 'strerror', error)}") from None
+            return "exists and is not a file"
+        return "" if path.absolute().parent.is_dir() else "no such directory"
+
+    return _checked(flag, text, problem)
+
+
+def _checked(flag: str, text: str, problem: Callable[[Path], str]) -> Path:
+    """The path that a flag names, if no problem is found with it.
+
+    Raises:
+        ConfigError: there is one, or its name cannot be shown, or the system refuses it.
+    """
+    check_name(flag, text)
+    path = Path(os.path.expanduser(text))
+    try:
+        found = problem(path)
+    except OSError as error:
+        found = str(error.strerror)
+    if found:
+        raise ConfigError(f"--{flag}={text}: {found}")
     return path
 
 

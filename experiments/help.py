@@ -22,7 +22,7 @@ GROUPS: dict[str, str] = {
     "max_grad_norm adam_eps",
     "Evaluation": "eval_every eval_games eval_max_steps eps_eval stop_at_return diagnostics diagnostics_kept",
     "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every keep_best keep_replay "
-    "logger print_config tune_runtime",
+    "logger print_config dry_run tune_runtime",
 }
 """Flags of training, in the order in which they are shown; others are a program's own."""
 

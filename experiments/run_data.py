@@ -2,21 +2,18 @@
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from srl_jax import ending
+from srl_jax import config, ending
 from srl_jax.config import Config
 from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import KINDS, read_metrics
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import LIMITS
-
-from .directories import runs_below
 
 
 class RunData(NamedTuple):
@@ -41,9 +38,19 @@ class RunData(NamedTuple):
     about: Mapping[str, Any] = MappingProxyType({})
 
     @property
+    def key(self) -> tuple[str, str, int]:
+        """What it is a run of: (game, arm, seed)."""
+        return self.game, self.arm, self.seed
+
+    @property
     def failed(self) -> bool:
         """Whether it ended with an error, and is not under way."""
         return self.ended is not None and self.ended.failed
+
+
+def in_order(runs: Iterable[RunData]) -> list[RunData]:
+    """Runs by game, arm and seed."""
+    return sorted(runs, key=lambda run: (run.game, natural(run.arm), run.seed))
 
 
 def arm_name(path: Path) -> str:
@@ -60,11 +67,59 @@ def load_run(path: Path) -> RunData:
     Raises:
         ConfigError: it is none, or what it holds is not what training writes.
     """
-    config = Config.load(path)
+    its, about = config.read(path)
     metrics = path / "metrics.jsonl"
     rows = read_rows(metrics) if metrics.exists() else []
-    about = parse_json(read_bytes(path / "config.json", SETTINGS))
-    return RunData(path, config.game, arm_name(path), config.seed, config, rows, ending.read(path), about)
+    return RunData(path, its.game, arm_name(path), its.seed, its, rows, ending.read(path), about)
+
+
+def runs_below(root: Path, file: str = "config.json") -> list[Path]:
+    """Directories with a config.json, or another file, in or below a directory.
+
+    Links are followed: a run may lie elsewhere.
+
+    Each is found once: by its own path where that is below, else by the first link to it. A link to what the
+    link or the root lies in is not followed.
+
+    Returns:
+        As `natural` sorts them.
+
+    Raises:
+        ConfigError: a directory cannot be read.
+    """
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):  # removed meanwhile, by a run that is under way
+            raise ConfigError(f"{error.filename}: {error.strerror}")
+
+    found: list[str] = []
+    seen: set[str] = set()
+    waiting = [os.fspath(root)]
+    while waiting:
+        links: list[str] = []
+        for top in waiting:
+            for folder, folders, files in os.walk(top, onerror=refuse):
+                real = os.path.realpath(folder)
+                if real in seen:
+                    folders.clear()
+                    continue
+                seen.add(real)
+                if file in files and os.path.isfile(os.path.join(folder, file)):
+                    found.append(folder)
+                paths = [os.path.join(folder, name) for name in folders]
+                links += [path for path in paths if os.path.islink(path) and not _around(path, real, root)]
+        waiting = sorted(links, key=natural)
+    return [Path(folder) for folder in sorted(found, key=natural)]
+
+
+def _around(link: str, *places: str | Path) -> bool:
+    """Whether a link leads to a directory in which one of the places lies."""
+    return any(Path(os.path.realpath(place)).is_relative_to(os.path.realpath(link)) for place in places)
+
+
+def natural(text: str) -> list:
+    """A key for sorting names with numbers in them by these: seed2 before seed10."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", text))]
 
 
 def run_directories(root: Path) -> list[Path]:

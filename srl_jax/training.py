@@ -43,7 +43,7 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
     modes.check(config)
     check_game(config)
     full = resolved(config)
-    checkpoint.check_sources(full)
+    check_sources(full)
 
     from srl_jax import loop
 
@@ -95,3 +95,33 @@ def resolved(config: Config) -> Config:
         objective = parse(text, objectives.REGISTRY, "objective")
         build(objective, objectives.REGISTRY, context)
     return full
+
+
+_SAME = {"encoder_from": "encoder", "policy_from": "game"}
+"""What a run must have in common with the one that a flag names, beside how frames are made."""
+
+
+def check_sources(config: Config) -> None:
+    """Whether the checkpoints that a run wants to start from exist and fit it; reads manifests alone.
+
+    Raises:
+        ConfigError: one line that names the flag and what differs.
+    """
+    for flag, own in _SAME.items():
+        if not (path := getattr(config, flag)):
+            continue
+        try:
+            found = checkpoint.read_manifest(path).config
+        except ConfigError as error:
+            raise ConfigError(f"--{flag}={path}: {error}") from None
+        if flag == "policy_from" and found.mode == "pretrain":
+            raise ConfigError(
+                f"--{flag}={path}: a representation run has no policy; name a run of another mode"
+            )
+        for field in (own, "frame_size", "frame_stack"):
+            what = {"encoder": "architecture", "game": "game"}.get(field, "preprocessing")
+            ours, theirs = getattr(config, field), getattr(found, field)
+            if ours != theirs:
+                raise ConfigError(
+                    f"--{flag}={path}: the {what} differs: {field} is {theirs} there and {ours} here"
+                )

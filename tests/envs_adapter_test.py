@@ -279,9 +279,13 @@ def test_an_environment_by_its_id(tmp_path, monkeypatch):
     games.game("gymnasium:id=SrlJaxSquare-v0").check()  # the package is known
     for text, says in (
         ("gymnasium:id=Nonesuch-v0", "cannot be made: NameNotFound: Environment `Nonesuch` doesn't exist"),
-        ("nonesuch_module:A-v0", "cannot be made: ModuleNotFoundError: No module named 'nonesuch_module'"),
+        (
+            "nonesuch_module:A-v0",
+            "cannot be made: ModuleNotFoundError: No module named 'nonesuch_module'",
+        ),
         ("srl_jax_own:Other-v0", "cannot be made: NameNotFound"),
     ):
         with pytest.raises(ConfigError) as raised:
             games.game(text).check()
         assert str(raised.value).startswith(says) and "\n" not in str(raised.value)
+        assert ("--import=PATH/FILE.py" in str(raised.value)) == ("nonesuch_module" in text)

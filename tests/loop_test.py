@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
 from experiments import flags as config_flags
-from srl_jax import actor, checkpoint, ending, loading, loop
+from srl_jax import actor, checkpoint, ending, loading, loop, training
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
@@ -237,7 +237,7 @@ def test_pretraining_on_a_given_policy_and_on_a_random_one(joint, tmp_path):
     train(tmp_path / "frozen", mode="frozen", encoder_from=str(tmp_path / "random"))
     config = Config(**SMALL, mode="pretrain", objectives=("inverse",), policy_from=str(tmp_path / "random"))
     with pytest.raises(ConfigError, match="has no policy"):
-        checkpoint.check_sources(config)
+        training.check_sources(config)
 
 
 def test_a_buffer_that_cannot_be_is_refused():
@@ -292,7 +292,7 @@ def test_an_encoder_that_does_not_fit_is_refused(joint):
     for field, value in (("encoder", "tiny:features=16"), ("frame_size", 84), ("frame_stack", 2)):
         config = Config(**{**SMALL, "mode": "frozen", "encoder_from": str(source), field: value})
         with pytest.raises(ConfigError, match=f"{field} is .* there and .* here"):
-            checkpoint.check_sources(config)
+            training.check_sources(config)
 
 
 def test_ctrl_c_in_the_middle_of_a_step_leaves_the_last_checkpoint(tmp_path, monkeypatch, capsys):

@@ -25,8 +25,8 @@ import numpy as np
 from absl import flags
 
 from srl_jax import display
-from srl_jax.config import git_revision, versions
 from srl_jax.errors import ConfigError
+from srl_jax.provenance import git_revision, versions
 from srl_jax.specs import Info, choices_text
 
 from .. import flags as config_flags

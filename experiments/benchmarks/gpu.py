@@ -12,8 +12,8 @@ from typing import Any
 
 from absl import flags
 
-from srl_jax.config import versions
 from srl_jax.errors import ConfigError
+from srl_jax.provenance import versions
 from srl_jax.specs import Info
 
 from .. import flags as config_flags

@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from srl_jax import envs, specs
-from srl_jax.config import INFOS, Config, history
+from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
+from srl_jax.provenance import history
 
 from .. import collect
 from ..collect import RunData

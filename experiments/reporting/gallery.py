@@ -19,7 +19,7 @@ from srl_jax.reading import parse_json
 from .. import plots, run_figures
 from ..collect import RunData
 from ..colours import Style
-from ..directories import natural
+from ..run_data import natural
 from . import numbers, pictures, readme
 from .pictures import Curve, Picture
 

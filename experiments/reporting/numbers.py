@@ -15,8 +15,8 @@ from srl_jax.statistics import NARROW, Interval
 
 from .. import collect
 from ..collect import RunData, has_policy
-from ..directories import natural
 from ..presets import PRESETS
+from ..run_data import natural
 
 NEVER = 1e18
 """Env steps that stand for never, where a median is drawn again."""

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 from absl import flags
 
-from srl_jax.config import git_revision
 from srl_jax.errors import ConfigError
+from srl_jax.provenance import git_revision
 from srl_jax.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text
 

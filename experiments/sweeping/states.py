@@ -11,12 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax import checkpoint, ending, rundir
+from srl_jax import checkpoint, ending, resuming, rundir
 from srl_jax.checkpoint import NUMBERS, PARAMS
 from srl_jax.config import INFOS, Config, another_run, difference
 from srl_jax.errors import ConfigError, saving
 
-from .. import directories
 from .manifest import Entry
 
 
@@ -48,7 +47,7 @@ def look(path: Path, config: Config) -> State:
             cannot read.
     """
     try:
-        blank = directories.blank(path)
+        blank = resuming.blank(path)
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     if not blank:

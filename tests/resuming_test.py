@@ -1,4 +1,4 @@
-"""experiments/directories.py: which directories may be written to, and where a run goes on."""
+"""srl_jax/resuming.py: where a run goes on; --out of experiments.train, and how runs are found on disk."""
 
 import contextlib
 import dataclasses
@@ -9,12 +9,12 @@ import shutil
 import numpy as np
 import pytest
 
-from experiments import directories
-from experiments.directories import all_to_resume, check_out, going_on, to_resume
-from srl_jax import checkpoint, ending, rundir
-from srl_jax import config as config_module
+from experiments import run_data
+from experiments.train import check_out
+from srl_jax import checkpoint, ending, provenance
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.resuming import all_to_resume, going_on, to_resume
 from srl_jax.rundir import run_directory
 from tests.helpers import NOT_FINITE, write_run
 from tests.rundir_test import contents
@@ -133,7 +133,7 @@ def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
     (run / "config.json").write_text(json.dumps({**began, "versions": {**there, "jax": "0.1"}, "cpus": 99}))
     monkeypatch.setenv("XLA_FLAGS", "--b")
     monkeypatch.setenv("NPROC", "3")
-    monkeypatch.setattr(config_module, "git_revision", lambda: "abc")
+    monkeypatch.setattr(provenance, "git_revision", lambda: "abc")
     assert to_resume(run, CONFIG) == made
     jax, numpy = (began["versions"][name] for name in ("jax", "numpy"))
     revision, cpus = began["git_revision"], began["cpus"]
@@ -151,7 +151,7 @@ def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
     assert continued["env_steps"] == 100 and continued["changed"] == changed | {"NPROC": "3"}
     # From now on that is what it is compared with, and history has both.
     assert to_resume(run, CONFIG) == made and capsys.readouterr().err == ""
-    assert config_module.history(said)["jax"] == ["0.1", jax]
+    assert provenance.history(said)["jax"] == ["0.1", jax]
     monkeypatch.delenv("NPROC")
     to_resume(run, CONFIG)
     assert "NPROC was '3' and is None" in capsys.readouterr().err
@@ -195,12 +195,6 @@ def test_a_run_whose_checkpoints_are_gone_is_not_begun_again(tmp_path):
     # Going on means that nothing is lost but what came after the last checkpoint.
     make(tmp_path / "run", reached=104)
     with pytest.raises(ConfigError, match="got to 104 env steps, and there is no checkpoint"):
-        to_resume(tmp_path / "run", CONFIG)
-
-
-def test_a_run_that_another_process_writes_is_refused(tmp_path):
-    make(tmp_path / "run", checkpoints=(100,))
-    with rundir.held(tmp_path / "run"), pytest.raises(ConfigError, match="process .* is writing there"):
         to_resume(tmp_path / "run", CONFIG)
 
 
@@ -408,21 +402,21 @@ def test_runs_behind_links_are_found_and_loops_end(tmp_path):
     (disk / "more/Catch/back").symlink_to(disk / "more")
     (root / "gone").symlink_to(tmp_path / "nowhere")
     names = ["joint_seed0", "joint_seed1", "joint_seed2", "more/Catch/a/seed0"]
-    assert directories.runs_below(root) == [root / name for name in names]
+    assert run_data.runs_below(root) == [root / name for name in names]
     # Links alone, and a link to all of it.
     (root / "joint_seed0").rename(disk / "joint_seed0")
     (root / "again").unlink()
     (root / "joint_seed0").symlink_to(disk / "joint_seed0")
-    assert len(directories.runs_below(root)) == 4
+    assert len(run_data.runs_below(root)) == 4
     (tmp_path / "link").symlink_to(root)
-    assert directories.runs_below(tmp_path / "link")[0] == tmp_path / "link/joint_seed0"
-    assert directories.runs_below(root / "joint_seed1") == [root / "joint_seed1"]
+    assert run_data.runs_below(tmp_path / "link")[0] == tmp_path / "link/joint_seed0"
+    assert run_data.runs_below(root / "joint_seed1") == [root / "joint_seed1"]
 
 
 def test_runs_come_in_the_order_of_their_numbers(tmp_path):
     for seed in (10, 2, 1):
         write_run(tmp_path / f"a/seed{seed}")
-    assert [path.name for path in directories.runs_below(tmp_path)] == ["seed1", "seed2", "seed10"]
+    assert [path.name for path in run_data.runs_below(tmp_path)] == ["seed1", "seed2", "seed10"]
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
@@ -430,7 +424,7 @@ def test_what_cannot_be_read_is_said(tmp_path):
     write_run(tmp_path / "a/seed0")
     (tmp_path / "b").mkdir(0o000)
     with pytest.raises(ConfigError, match="b: Permission denied"):
-        directories.runs_below(tmp_path)
+        run_data.runs_below(tmp_path)
 
 
 def test_a_linked_run_is_gone_on_with_and_not_deleted(tmp_path):
