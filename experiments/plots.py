@@ -17,6 +17,7 @@ from srl_jax import envs, statistics
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 
+from . import collect
 from .colours import Style, styles
 
 STEPS_LABEL = "env steps"
@@ -208,7 +209,7 @@ def _below(figure, width: int, handles: dict[str, Any], panels: Sequence[Panel],
 def policy_levels(config: Config) -> list[Level]:
     """What policies that learn nothing score on a run's game."""
     found = reference_policies(config.game).items()
-    return [Level(name, row.return_mean, row.differs_from(config)) for name, row in found]
+    return [Level(name, row.return_mean, collect.differs(row, config)) for name, row in found]
 
 
 def differences(

@@ -1,5 +1,6 @@
 """Tests of experiments.train and experiments.resume: where a run is written, and from where it goes on."""
 
+import importlib.util
 import json
 import os
 import signal
@@ -335,11 +336,12 @@ def test_a_game_that_cannot_be_made_leaves_nothing(capsys, loop, tmp_path):
 
 
 def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):
-    monkeypatch.setattr(train.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(SystemExit):
         train_in_process("--game=Pong", f"--out={tmp_path}/a")
     assert "--game=Pong: Atari needs ale-py" in capsys.readouterr().err
-    assert "--tensorboard" in refused(capsys, "--tensorboard", f"--out={tmp_path}/a")
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert "needs wandb: pip install wandb" in refused(capsys, "--logger=wandb", f"--out={tmp_path}/a")
 
 
 def test_a_dry_run_says_what_would_be_done_and_writes_nothing(capsys, loop, tmp_path):

@@ -93,6 +93,7 @@ def build(
         "numbers": numbers,
         "game_record": envs.known,
         "policies": reference_policies,
+        "differs": collect.differs,
         "published": published,
         "readmes": readmes,
         "title": readmes[0].title if len(readmes) == len(places) == 1 else "",
