@@ -1,7 +1,7 @@
 """Builds an agent from a configuration: encoder, objectives, jitted functions that init, update and act."""
 
 import inspect
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -247,7 +247,7 @@ class Seeds(NamedTuple):
         follow: TrainState -> TrainState.
         act: (params, [frames uint8 [N, S, H, W]], [key], step, epsilon) -> actions.
         stack: [tree of each seed] -> tree.
-        part: (tree, i) -> the tree of seed i, on the device.
+        parts: tree -> the tree of each seed in turn, on the device.
         rows: tree -> [tree of each seed], on the host; waits for the device.
     """
 
@@ -256,7 +256,7 @@ class Seeds(NamedTuple):
     follow: Callable
     act: Callable
     stack: Callable
-    part: Callable
+    parts: Callable[[Any], Iterable[Any]]
     rows: Callable
 
 
@@ -276,7 +276,7 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
             follow=agent.follow,
             act=lambda params, frames, keys, *now: agent.act(params, frames[0], keys[0], *now),
             stack=lambda trees: trees[0],
-            part=lambda tree, i: tree,
+            parts=lambda tree: [tree],
             rows=lambda tree: [jax.device_get(tree)],
         )
 
@@ -292,6 +292,8 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
 
     act = jax.vmap(inspect.unwrap(agent.act), in_axes=(0, 0, 0, None, None))
 
+    part = jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree))
+
     def rows(tree: Any) -> list[Any]:
         tree = jax.device_get(tree)
         return [jax.tree.map(lambda x: x[i], tree) for i in range(number)]  # noqa: B023
@@ -302,6 +304,6 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
         follow=jax.jit(jax.vmap(inspect.unwrap(agent.follow))),
         act=jax.jit(lambda params, frames, keys, *now: act(params, jnp.stack(frames), jnp.stack(keys), *now)),
         stack=jax.jit(stacked),
-        part=jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree)),
+        parts=lambda tree: (part(tree, i) for i in range(number)),
         rows=rows,
     )
