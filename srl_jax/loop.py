@@ -143,7 +143,6 @@ class Run:
                 seed.policy = policy(named_key(seed.key, "given policy"))
         self.env_steps = self.updates = 0
         self.waiting: list[dict] = []  # metrics of updates, on the device
-        self.resumed = resume is not None
         if resume is None:
             start = initial_params(config, frame, self.agent)
             states = [self.agent.init(seed.key, start) for seed in self.seeds]
@@ -194,12 +193,12 @@ class Run:
     def run(self) -> bool:
         """To the last env step, or to the return that ends the run; False where it was told to stop."""
         config, progress = self.config, self.seeds[0].report.progress
-        if self.resumed:
-            for seed in self.seeds:
-                seed.play()
-        else:
+        if self.seeds[0].saved is None:
             self.begin()
             self.start_evaluation()
+        else:
+            for seed in self.seeds:
+                seed.play()
         while self.env_steps < config.steps:
             if self.stop():
                 self.save()

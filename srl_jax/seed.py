@@ -99,7 +99,6 @@ class Seed:
         self.solved = False
         self.evaluating: Evaluating | None = None
         self.games: Future[tuple[Evaluation, float]] | None = None  # of that evaluation, and seconds
-        self.left = False  # nobody waits for them any more
         self.eval_thread = yielding_threads("evaluation", 1)
         self.eval_env: Any = None  # made when there is something to play
         self.saved: Manifest | None = None
@@ -185,7 +184,7 @@ class Seed:
             stack=config.frame_stack,
             max_steps=config.eval_max_steps,
             record=RECORDED,
-            stop=lambda: self.left,
+            stop=lambda: self.evaluating is None,
         )
         return played, time.perf_counter() - began
 
@@ -214,7 +213,7 @@ class Seed:
         stack.callback(self.close)
         stack.enter_context(self.report)
         stack.enter_context(self.eval_thread)
-        stack.callback(setattr, self, "left", True)
+        stack.callback(setattr, self, "evaluating", None)  # nobody waits for its games any more
 
     def close(self) -> None:
         """Closes the environments."""

@@ -235,13 +235,13 @@ OF_A_RUN = {
     "of the configuration": {
         "config", "checkpoint_every", "agent", "device", "schedules", "act_keys", "stop",
     },
-    "of the process": {"env_threads", "resumed"},
+    "of the process": {"env_threads"},
 }  # fmt: skip
 OF_A_SEED = {
     "in parts": {
         "replay", "env", "report", "stacks", "score", "rng", "recording", "best", "solved", "evaluating",
     },
-    "of the process": {"games", "left", "eval_thread", "eval_env"},
+    "of the process": {"games", "eval_thread", "eval_env"},
     "the checkpoint itself": {"saved", "saved_position"},
     "of the configuration": {"config", "out", "agent", "key", "policy"},
     "in encoders/": {"diagnostics"},
