@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from srl_jax.diagnostics import rows as of_rows
+from srl_jax.diagnostics import drift
 
 from .plots import COLOURS, count_axis, log_axis, new_figure, save, steps_label
 
@@ -35,7 +35,7 @@ def drift_matrix(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike, tit
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import EngFormatter
 
-    found = {name: of_rows.drift_matrix(rows, name) for name in of_rows.drift_names(rows)}
+    found = {name: drift.drift_matrix(rows, name) for name in drift.drift_names(rows)}
     found = {n: (steps, m) for n, (steps, m) in found.items() if len(steps) > 1 and (m > 0).any()}
     if not found:
         return None

@@ -14,7 +14,7 @@ from absl import flags
 from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.data import reference_policies, thesis_curve
-from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
+from srl_jax.diagnostics.drift import STEPS, drift_matrix, drift_names
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import KINDS, read_metrics
 from srl_jax.specs import LIMITS

@@ -1,7 +1,8 @@
 """Builds an agent from a configuration: encoder, objectives, jitted functions that init, update and act."""
 
 import inspect
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -10,7 +11,7 @@ from jax.typing import ArrayLike
 
 from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
-from srl_jax.diagnostics.device import Functions, make_functions
+from srl_jax.diagnostics.functions import Functions, make_functions
 from srl_jax.modes import MODES, Mode, encoder_learning_rate, second_learning_rate
 from srl_jax.optim import RL, make_optimizer
 from srl_jax.rl import Algorithm
@@ -180,33 +181,16 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         "representation": config.lr_srl,
     }
 
-    def jitted_update(only: Collection[str]) -> Update:
-        update = make_update(
-            encoder,
-            terms,
-            mode,
-            optimizer,
-            augment=config.augment,
-            target_encoder=config.target_encoder,
-            encoder_optimizer=config.encoder_optimizer,
-            only=only,
-            slow_follows=False,
-        )
-        plan = passes(mode, [name for name in terms if name in only], config.encoder_optimizer)
-        return Update(update, plan)
+    def jitted_update(plan: Sequence[Pass]) -> Update:
+        how = partial(make_update, plan=plan, augment=config.augment, slow_follows=False)
+        return Update(how(encoder, terms, mode, optimizer), plan)
 
     def jitted_act(noisy: bool) -> Act:
         act = make_act(encoder, algorithm.q_values, noisy=noisy)
         return jax.jit(lambda params, *rest: act(params["encoder"], params[RL], *rest))
 
-    init = make_init(
-        encoder,
-        terms,
-        mode,
-        optimizer,
-        target_encoder=config.target_encoder,
-        encoder_optimizer=config.encoder_optimizer,
-    )
+    plan = passes(mode, terms, config.encoder_optimizer)
+    init = make_init(encoder, terms, mode, optimizer, plan=plan, target_encoder=config.target_encoder)
     return Agent(
         mode=mode,
         encoder=encoder,
@@ -215,8 +199,8 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         horizon=max(1, *(o.horizon for o in terms.values())),
         # It runs once: compile it fast.
         init=jax.jit(init, compiler_options={"xla_backend_optimization_level": 0}),
-        update=jitted_update(terms.keys()),
-        update_rl=jitted_update({RL}) if config.srl_every > 1 else None,
+        update=jitted_update(plan),
+        update_rl=jitted_update(passes(mode, [RL])) if config.srl_every > 1 else None,
         follow=jax.jit(make_follow(terms)),
         follow_every=follow_every(terms),
         act=jitted_act(noisy=True),
@@ -226,14 +210,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},
         ),
-        measures=make_functions(
-            encoder,
-            terms,
-            mode,
-            channels=channels,
-            augment=config.augment,
-            target_encoder=config.target_encoder,
-        ),
+        measures=make_functions(encoder, terms, mode, channels=channels, augment=config.augment),
     )
 
 

@@ -15,7 +15,7 @@ from srl_jax.actor import FrameStack, Policy, make_env, random_policy, seed_for,
 from srl_jax.agent import Agent
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config
-from srl_jax.diagnostics.measure import Diagnostics
+from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
 from srl_jax.evaluate import Evaluation, evaluate
 from srl_jax.loading import greedy_policy
