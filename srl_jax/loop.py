@@ -210,10 +210,8 @@ class Run:
                 passed(before, self.env_steps, every)
                 for every in (config.log_every, config.eval_every, self.checkpoint_every)
             )
-            if log or evaluate:
-                self.finish_evaluation()
-                if all(seed.solved for seed in self.seeds):
-                    break
+            if (log or evaluate) and self.finish_evaluation():
+                break
             if log:
                 self.write_train_rows()
             save = save and self.env_steps < config.steps
@@ -318,13 +316,17 @@ class Run:
         for seed, state in self.each(self.state):
             seed.start_evaluation(state, self.env_steps, self.updates, self.now)
 
-    def finish_evaluation(self) -> None:
+    def finish_evaluation(self) -> bool:
         """Waits for the evaluation that is under way, if one is, and writes its rows.
 
         Called before the next row is written, so that rows are in the same order however long games take.
+
+        Returns:
+            Whether all seeds have reached the return that ends the run.
         """
-        for seed in self.seeds:
-            seed.finish_evaluation(self.env_steps)
+        means = [seed.finish_evaluation(self.env_steps) for seed in self.seeds]
+        wanted = self.config.stop_at_return
+        return wanted is not None and min(means) >= wanted
 
     def save(self) -> None:
         """Writes checkpoints that can be resumed from, unless there are some of this moment."""

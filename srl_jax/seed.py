@@ -50,7 +50,6 @@ class Seed:
 
     Attributes:
         best: the largest mean return of an evaluation so far.
-        solved: whether the last evaluation reached the return that ends the run.
         evaluating: the evaluation that is under way; its games are played in a thread.
         saved: the newest checkpoint that can be resumed from; None before there is one.
 
@@ -96,7 +95,6 @@ class Seed:
             self.diagnostics = Diagnostics(config, agent.measures, agent.horizon, out, say)
         self.recording: np.ndarray | None = None  # uint8 [T, H, W, C], the first games of the last evaluation
         self.best = -np.inf
-        self.solved = False
         self.evaluating: Evaluating | None = None
         self.games: Future[tuple[Evaluation, float]] | None = None  # of that evaluation, and seconds
         self.eval_thread = yielding_threads("evaluation", 1)
@@ -188,25 +186,27 @@ class Seed:
         )
         return played, time.perf_counter() - began
 
-    def finish_evaluation(self, env_steps: int) -> None:
-        """Waits for the evaluation under way, if there is one, and writes its row; keeps the best parameters.
+    def finish_evaluation(self, env_steps: int) -> float:
+        """Waits for the evaluation under way and writes its row; keeps the best parameters.
 
         Args:
             env_steps: of now, where the progress bar stands.
+
+        Returns:
+            Its mean return; -inf where none is under way.
         """
         if self.evaluating is None or self.games is None:
-            return
+            return -np.inf
         played, seconds = self.games.result()
         (params, then, updates, values), self.evaluating = self.evaluating, None
         self.recording = played.frames
         mean = self.report.evaluation(then, updates, played, seconds, values)
         self.report.progress.update(env_steps, evaluation=mean)
-        wanted = self.config.stop_at_return
-        self.solved = wanted is not None and mean >= wanted
         if mean > self.best:
             self.best = mean
             if self.config.keep_best:
                 self.save_parameters(params, then, updates, folder="best", keep=1)
+        return mean
 
     def open(self, stack: contextlib.ExitStack) -> None:
         """Opens rows and threads in a context, which closes them and the environments."""
@@ -237,7 +237,6 @@ class Seed:
         recording = {} if self.recording is None else {"recording": self.recording}
         numbers = {
             "best": self.best if np.isfinite(self.best) else None,
-            "solved": self.solved,
             "evaluating": self.evaluating and self.evaluating[1:],
             "rng": self.rng.bit_generator.state,
         }
@@ -248,7 +247,6 @@ class Seed:
         self.score[:] = fitting(arrays, "score", self.score)
         self.recording = arrays["recording"] if "recording" in arrays else None
         self.best = -np.inf if numbers["best"] is None else float(numbers["best"])
-        self.solved = bool(numbers["solved"])
         self.rng.bit_generator.state = numbers["rng"]
 
     def save(self, state: TrainState, env_steps: int, updates: int) -> None:
@@ -317,8 +315,6 @@ class Seed:
                 raise
             reason = f"{type(error).__name__}: {error}"
             raise ConfigError(f"{where}: cannot be resumed from: {reason}") from None
-        if manifest.config.stop_at_return != self.config.stop_at_return:
-            self.solved = False
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         key = jax.random.wrap_key_data(learner.pop("key"))
         return real_copy(shapes._replace(params=params, key=key, **learner))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.typing import ArrayLike
 
 from srl_jax.augment import random_shift
 from srl_jax.modes import ENCODER_OPTIMIZERS, Mode
@@ -410,9 +411,13 @@ def make_act(encoder: Encoder, q_values: Callable, *, noisy: bool) -> Callable:
         noise_key, coin_key, action_key = jax.random.split(jax.random.fold_in(key, step), 3)
         z = encoder.apply(params, stack_last(frames))
         q = q_values(head, z, noise_key if noisy else None)
-        number, num_actions = q.shape
-        random = jax.random.randint(action_key, (number,), 0, num_actions)
-        explore = jax.random.uniform(coin_key, (number,)) < epsilon
-        return jnp.where(explore, random, jnp.argmax(q, -1)).astype(jnp.int32)
+        return epsilon_greedy(q, coin_key, action_key, epsilon)
 
     return act
+
+
+def epsilon_greedy(q: Array, coin_key: Array, action_key: Array, epsilon: ArrayLike) -> jax.Array:
+    """int32 [...]: the greedy action of values [..., A], or with probability epsilon one drawn uniformly."""
+    random = jax.random.randint(action_key, q.shape[:-1], 0, q.shape[-1])
+    explore = jax.random.uniform(coin_key, q.shape[:-1]) < epsilon
+    return jnp.where(explore, random, jnp.argmax(q, -1)).astype(jnp.int32)

@@ -184,7 +184,7 @@ def test_a_return_that_ends_a_run_ends_it_all_the_same(tmp_path, monkeypatch, st
     monkeypatch.setattr(seed, "evaluate", better)
     config = make_config("rl_only", stop_at_return=0.5)
     result, whole_end = go(config, tmp_path / "whole")
-    assert result.env_steps == 160 and '"solved": true' in whole_end["play"] and not result.interrupted
+    assert result.env_steps == 160 and '"best": 1.0' in whole_end["play"] and not result.interrupted
     go(config, tmp_path / "run", stop)
     result, end = resume(config, tmp_path / "run")
     assert result.env_steps == 160 and end == whole_end
@@ -239,7 +239,7 @@ OF_A_RUN = {
 }  # fmt: skip
 OF_A_SEED = {
     "in parts": {
-        "replay", "env", "report", "stacks", "score", "rng", "recording", "best", "solved", "evaluating",
+        "replay", "env", "report", "stacks", "score", "rng", "recording", "best", "evaluating",
     },
     "of the process": {"games", "eval_thread", "eval_env"},
     "the checkpoint itself": {"saved", "saved_position"},
