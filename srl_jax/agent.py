@@ -143,6 +143,27 @@ class Agent(NamedTuple):
     measures: Functions
 
 
+def components(
+    config: Config, frame_shape: tuple[int, int, int], num_actions: int
+) -> tuple[Encoder, Algorithm, dict[str, Objective]]:
+    """The encoder, the RL algorithm and the representation objectives that a configuration names.
+
+    Args:
+        config, frame_shape, num_actions: see `make_agent`.
+
+    Raises:
+        srl_jax.specs.SpecError: where a spec does not fit.
+    """
+    height, width, channels = frame_shape
+    shape = (height, width, config.frame_stack * channels)
+    encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
+    context = Context.of(encoder, num_actions)
+    algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
+    parsed = [specs.parse(text, objectives.REGISTRY, "objective") for text in config.objectives]
+    terms = {spec.name: specs.build(spec, objectives.REGISTRY, context) for spec in parsed}
+    return encoder, algorithm, terms
+
+
 def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: int) -> Agent:
     """Builds an `Agent`.
 
@@ -155,19 +176,11 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         srl_jax.specs.SpecError: where a spec does not fit.
     """
     mode = MODES[config.mode]
-    height, width, channels = frame_shape
-    shape = (height, width, config.frame_stack * channels)
-    encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
-    context = Context.of(encoder, num_actions)
-    algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
-    terms: dict[str, Objective] = {}
+    encoder, algorithm, terms = components(config, frame_shape, num_actions)
+    if not mode.representation:
+        terms = {}
     if mode.rl:
-        slow = periodic(config.slow_update_every)
-        terms[RL] = algorithm.objective._replace(slow=slow)
-    if mode.representation:
-        for text in config.objectives:
-            spec = specs.parse(text, objectives.REGISTRY, "objective")
-            terms[spec.name] = specs.build(spec, objectives.REGISTRY, context)
+        terms = {RL: algorithm.objective._replace(slow=periodic(config.slow_update_every)), **terms}
     optimizer = make_optimizer(
         terms,
         decoder_weight_decay=config.decoder_weight_decay,
@@ -210,7 +223,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},
         ),
-        measures=make_functions(encoder, terms, mode, channels=channels, augment=config.augment),
+        measures=make_functions(encoder, terms, mode, channels=frame_shape[-1], augment=config.augment),
     )
 
 
