@@ -108,43 +108,29 @@ class Seed:
         self.stacks.begin(frames)
         self.replay.begin(frames)
 
-    def step_env(self, actions: np.ndarray) -> tuple:
+    def step_env(self, actions: np.ndarray) -> tuple[tuple, np.ndarray, np.ndarray | None]:
         """Takes a step of the environments and resets those whose game ended; touches nothing else.
 
         Returns:
-            What `take` takes.
+            The arguments of `Replay.add`, the raw rewards, and the frames after those games that ended were
+            reset; None where none ended.
         """
         frames, rewards, terminated, truncated, info = self.env.step(actions)
+        learnt = np.sign(rewards) if self.config.reward_clip else rewards
+        lost = info["life_lost"] if self.config.life_loss else np.zeros(len(actions), bool)
         over, begun = terminated | truncated, None
         if over.any():
             begun, _ = self.env.reset(options={"reset_mask": over})
-        return actions, frames, rewards, terminated, truncated, info["life_lost"], begun
+        return (actions, learnt.astype(np.float32), terminated, truncated, lost, frames), rewards, begun
 
-    def take(
-        self,
-        actions: np.ndarray,
-        frames: np.ndarray,
-        rewards: np.ndarray,
-        terminated: np.ndarray,
-        truncated: np.ndarray,
-        life_lost: np.ndarray,
-        begun: np.ndarray | None,
-    ) -> None:
-        """Adds a step of N environments to replay, to the stacks of frames and to the scores.
-
-        Args:
-            actions: int32 [N].
-            frames, rewards, terminated, truncated: what `env.step` returned.
-            life_lost: bool [N].
-            begun: the frames after those games that ended were reset; None where none ended.
-        """
-        config, over = self.config, terminated | truncated
-        learnt = np.sign(rewards) if config.reward_clip else rewards
-        lost = life_lost if config.life_loss else np.zeros(config.num_envs, bool)
-        self.replay.add(actions, learnt.astype(np.float32), terminated, truncated, lost, frames)
+    def take(self, step: tuple, rewards: np.ndarray, begun: np.ndarray | None) -> None:
+        """Adds what `step_env` gave to replay, to the stacks of frames and to the scores."""
+        _, _, terminated, truncated, _, frames = step
+        self.replay.add(*step)
         self.score += rewards
         self.stacks.push(frames)
         if begun is not None:
+            over = terminated | truncated
             self.report.ended(self.score[over])
             self.score[over] = 0.0
             self.stacks.begin(begun, over)
@@ -310,11 +296,10 @@ class Seed:
                     tree = checkpoint.load_tree(manifest, "evaluating")
                     played = checkpoint.load_into(shapes.params, tree, where)
                 self.evaluating = Evaluating(real_copy(played), *evaluating)
+        except ConfigError:
+            raise
         except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
-            if isinstance(error, ConfigError):
-                raise
-            reason = f"{type(error).__name__}: {error}"
-            raise ConfigError(f"{where}: cannot be resumed from: {reason}") from None
+            raise ConfigError(f"{where}: cannot be resumed from: {type(error).__name__}: {error}") from None
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         key = jax.random.wrap_key_data(learner.pop("key"))
         return real_copy(shapes._replace(params=params, key=key, **learner))
