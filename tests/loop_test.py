@@ -439,7 +439,8 @@ def test_a_row_that_cannot_be_written_ends_the_run_with_its_threads(tmp_path, mo
     before = threading.active_count()
     with pytest.raises(SaveError, match="metrics.jsonl: a row was not written: No space left"):
         train(tmp_path / "run", checkpoint_every=20)
-    assert whole(tmp_path / "run").env_steps == 120  # before the evaluation whose row it is
+    manifest = whole(tmp_path / "run")  # where the evaluation whose row it is was under way
+    assert manifest.env_steps == 140 and "evaluating.msgpack" in manifest.files
     assert threading.active_count() <= before
 
 
