@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 from srl_jax import config, ending
 from srl_jax.config import Config
-from srl_jax.diagnostics.rows import STEPS, drift_matrix, drift_names
+from srl_jax.diagnostics.drift import STEPS, drift_matrix, drift_names
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import KINDS, read_metrics

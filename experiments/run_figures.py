@@ -10,7 +10,7 @@ import numpy as np
 from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.data import thesis_curve
-from srl_jax.diagnostics import rows as of_rows
+from srl_jax.diagnostics import drift
 from srl_jax.errors import ConfigError
 
 from . import images, plots
@@ -124,7 +124,7 @@ def numbers(
         The path, or None if there is nothing to draw (then nothing is written).
     """
     known = sorted({key for row in rows for key in row})
-    elsewhere = (of_rows.STEPS, of_rows.DECODER_NOW, of_rows.ENCODER_NOW)  # in `drift_matrix`
+    elsewhere = (drift.STEPS, drift.DECODER_NOW, drift.ENCODER_NOW)  # in `drift_matrix`
     keys = [key for kind in kinds for key in known if key.partition("/")[0] == kind]
     panels: dict[str, list[plots.Line]] = {}
     for key in (key for key in keys if not key.startswith(elsewhere)):
@@ -179,7 +179,7 @@ def drift_matrix(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike, tit
     from matplotlib.colors import LogNorm
     from matplotlib.ticker import EngFormatter
 
-    found = {name: of_rows.drift_matrix(rows, name) for name in of_rows.drift_names(rows)}
+    found = {name: drift.drift_matrix(rows, name) for name in drift.drift_names(rows)}
     found = {n: (steps, m) for n, (steps, m) in found.items() if len(steps) > 1 and (m > 0).any()}
     if not found:
         return None

@@ -8,7 +8,6 @@ from srl_jax import checkpoint, envs, modes, plugins
 from srl_jax.config import Config, resolve
 from srl_jax.errors import ConfigError
 from srl_jax.rundir import run_directory
-from srl_jax.specs import build, parse
 
 if TYPE_CHECKING:
     from srl_jax.loop import Result
@@ -77,23 +76,17 @@ def resolved(config: Config) -> Config:
             these frames, or a logger's package is missing.
     """
     from srl_jax import encoders, loggers, objectives, rl
-    from srl_jax.types import Context
+    from srl_jax.agent import components
 
     if config.imports:
         plugins.load(config.imports)
         check_game(config, imported=True)
     loggers.check(config.loggers)
     full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
-    # Options may be valid one by one and not together, or not for these frames: only a factory
-    # knows. The number of actions is not known yet; any will do for that.
-    size = config.frame_size or 84  # an environment's own is known once it is made
-    shape = (size, size, config.frame_stack)
-    encoder = build(parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
-    context = Context.of(encoder, num_actions=18)
-    build(parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
-    for text in config.objectives:
-        objective = parse(text, objectives.REGISTRY, "objective")
-        build(objective, objectives.REGISTRY, context)
+    # Options may be valid one by one and not together, or not for these frames: only a factory knows. An
+    # environment's own size and its number of actions are known once it is made; any will do for that.
+    size = config.frame_size or 84
+    components(config, (size, size, 1), num_actions=18)
     return full
 
 

@@ -30,8 +30,7 @@ def digest(run: Any) -> dict[str, str]:
         return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()
 
     sums = {"counts": json.dumps([run.env_steps, run.updates])}
-    for i, seed in enumerate(run.seeds):
-        state = run.device.part(run.state, i)
+    for i, (seed, state) in enumerate(run.each(run.state)):
         state = state._replace(key=jax.random.key_data(state.key))
         leaves = jax.tree_util.tree_leaves_with_path(state)
         sums |= {f"seed {i} state{jax.tree_util.keystr(k)}": of(x) for k, x in leaves}
@@ -39,7 +38,6 @@ def digest(run: Any) -> dict[str, str]:
             if name != "report":  # whose rows are compared
                 arrays, numbers = snapshot()
                 sums |= {f"seed {i} {name} {key}": of(x) for key, x in arrays.items()}
-                numbers = {key: x for key, x in (numbers or {}).items() if key != "evaluation_due"}
                 sums[f"seed {i} {name}"] = json.dumps(numbers)
     return sums
 

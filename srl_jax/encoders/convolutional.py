@@ -1,7 +1,9 @@
 """Convolutional encoders and the decoders that mirror them, as tables of layers."""
 
+import functools
+import inspect
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -40,9 +42,6 @@ class Start(NamedTuple):
             tenths.
         decoder_scale: factor of the initial kernel of the decoder's last layer. At full size the first
             images are all contrast; a tenth starts near black.
-
-    Raises:
-        ValueError: from `check`, where a value is out of range.
     """
 
     init: str = "pytorch"
@@ -50,12 +49,32 @@ class Start(NamedTuple):
     gain: float = 1.0
     decoder_scale: float = 1.0
 
-    def check(self) -> None:
-        if self.init not in INITIALISERS:
-            raise ValueError(f"init: {choices_text(self.init, INITIALISERS)}")
+
+def starting(factory: Callable[..., Encoder]) -> Callable[..., Encoder]:
+    """A row of encoders: a factory of one from a `Start`, whose fields become options behind its own.
+
+    Args:
+        factory: (observation_shape, start, **options) -> Encoder.
+
+    Raises:
+        ValueError: from the row, where a value of `Start` is out of range.
+    """
+    shape, _, *own = inspect.signature(factory).parameters.values()
+
+    @functools.wraps(factory)
+    def row(observation_shape: tuple[int, int, int], **options: Any) -> Encoder:
+        start = Start(**{name: options.pop(name) for name in Start._fields if name in options})
+        if start.init not in INITIALISERS:
+            raise ValueError(f"init: {choices_text(start.init, INITIALISERS)}")
         for name in ("gain", "decoder_scale"):
-            if not 1e-3 <= getattr(self, name) <= 1e3:
+            if not 1e-3 <= getattr(start, name) <= 1e3:
                 raise ValueError(f"{name} must be at least 0.001 and at most 1000")
+        return factory(observation_shape, start, **options)
+
+    of_start = list(inspect.signature(Start).parameters.values())
+    options = [*own, *(p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in of_start)]
+    row.__dict__["__signature__"] = inspect.Signature([shape, *options])
+    return row
 
 
 class EncoderNetwork(nn.Module):
@@ -161,9 +180,8 @@ def convolutional_encoder(
         sigmoid: whether the decoder ends in a sigmoid (in (0, 1)) or is linear at the end.
 
     Raises:
-        ValueError: where the image is too small for the layers, or `start` is out of range.
+        ValueError: where the image is too small for the layers.
     """
-    start.check()
     *sides, channels = observation_shape
     layers = tuple(layers)
     sizes = tuple(zip(*(layer_sides(side, layers) for side in sides), strict=True))

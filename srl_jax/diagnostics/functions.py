@@ -5,11 +5,12 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import optax
 
 from srl_jax.modes import Mode
 from srl_jax.optim import RL
-from srl_jax.types import Array, Encoder, Latents, Objective, Params, Window
-from srl_jax.update import make_conflict
+from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
+from srl_jax.update import Hyper, make_losses
 from srl_jax.window import stack_last
 
 
@@ -23,7 +24,7 @@ class Functions(NamedTuple):
             targets and outputs the newest two frames, float32 [B, 2, H, W, C] (of observations of one frame,
             [B, 1, H, W, C]).
         others: names of objectives with an image that need more than that.
-        conflict: `srl_jax.update.make_conflict`'s; None where RL and representation losses do not both run.
+        conflict: `make_conflict`'s; None where RL and representation losses do not both run.
     """
 
     encode: Callable
@@ -43,23 +44,57 @@ def make_functions(
     *,
     channels: int,
     augment: str,
-    target_encoder: str,
 ) -> Functions:
-    """The functions of an agent; C is `channels`, other options are those of `srl_jax.update.make_update`."""
+    """The functions of an agent; C is `channels`, `augment` as of `srl_jax.update.make_update`."""
     images = {name: objective.image for name, objective in objectives.items() if objective.image}
     decode = {name: _decode(image) for name, image in images.items()}
     ready = {n: f for n, f in decode.items() if _enough(f, objectives[n], encoder, channels)}
     conflict = None
     if mode.rl and mode.representation and len(objectives) > 1 and RL in objectives:
-        conflict = jax.jit(
-            make_conflict(encoder, objectives, mode, augment=augment, target_encoder=target_encoder)
-        )
+        conflict = jax.jit(make_conflict(encoder, objectives, mode, augment=augment))
     return Functions(
         encode=jax.jit(lambda params, frames: encoder.apply(params, stack_last(frames))),
         decode={name: jax.jit(function) for name, function in ready.items()},
         others=tuple(images.keys() - ready.keys()),
         conflict=conflict,
     )
+
+
+def make_conflict(
+    encoder: Encoder,
+    objectives: Mapping[str, Objective],
+    mode: Mode,
+    *,
+    augment: str,
+) -> Callable:
+    """conflict: (TrainState, Window, Hyper) -> {name: (cosine, norm ratio)}, pure; for each but RL.
+
+    The cosine of an objective's gradient on the encoder's parameters with RL's, and its norm over RL's norm,
+    both gradients of `weight * mean(losses)`. Every loss's gradient enters the encoder here, whatever the
+    mode: in mode decoupled it is the gradient that RL's would be.
+    """
+    both = mode._replace(rl_trains_encoder=True, representation_trains_encoder=True)
+
+    def conflict(state: TrainState, window: Window, hyper: Hyper):
+        def gradient(name: str) -> Params:
+            losses_of = make_losses(encoder, {name: objectives[name]}, both, augment=augment)
+
+            def loss(tree: Params) -> Array:
+                losses, _ = losses_of({**state.params, "encoder": tree}, state, window)
+                return hyper.weights[name] * jnp.mean(losses[name])
+
+            return jax.grad(loss)(state.params["encoder"])
+
+        of_rl = gradient(RL)
+        norm = optax.tree.norm(of_rl)
+        found = {}
+        for name in sorted(objectives.keys() - {RL}):
+            other = gradient(name)
+            other_norm = optax.tree.norm(other)
+            found[name] = optax.tree.vdot(of_rl, other) / (norm * other_norm), other_norm / norm
+        return found
+
+    return conflict
 
 
 def _decode(image: Callable) -> Callable:

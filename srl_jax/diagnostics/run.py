@@ -14,7 +14,7 @@ from srl_jax import checkpoint
 from srl_jax.actor import seed_for
 from srl_jax.config import Config
 from srl_jax.diagnostics import measures
-from srl_jax.diagnostics.device import Functions
+from srl_jax.diagnostics.functions import Functions
 from srl_jax.diagnostics.heldout import HeldOut, collect
 from srl_jax.errors import ConfigError
 from srl_jax.replay import Replay
