@@ -6,8 +6,8 @@ from gymnasium.error import ResetNeeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.soaking.snapshots import MOMENTS, Player, goes_on, same
 from srl_jax import envs
+from tests.players import MOMENTS, Player, goes_on, same
 
 RESET = 255
 """An unseeded reset among the events of Atari's snapshots."""
