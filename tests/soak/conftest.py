@@ -9,9 +9,14 @@ import platform
 import sys
 import time
 from pathlib import Path
+from unittest import mock
 
 import pytest
+from absl import flags
 
+from experiments import flags as config_flags
+from experiments import train
+from srl_jax import checkpoint
 from srl_jax.config import Config, git_revision
 from srl_jax.metrics import read_metrics, strip_wall
 
@@ -80,6 +85,40 @@ def progress(request, say):
     return tell
 
 
+# A small run, and what a run has left
+
+
+SMALL_RUN = (
+    "--game=Catch", "--frame_size=42", "--encoder=tiny:features=16", "--rl=rainbow:hidden=16,atoms=11",
+    "--mode=joint", "--objective=reconstruction", "--num_envs=4", "--buffer_size=400", "--batch_size=8",
+    "--updates_per_step=0.2", "--learn_start=40", "--eval_every=80", "--eval_games=2", "--eval_max_steps=30",
+    "--log_every=40", "--checkpoint_every=40", "--slow_update_every=7", "--nodiagnostics", "--keep_replay",
+    "--tune_runtime=off",
+)  # fmt: skip
+"""Of the seconds that tests take, most are of its compilation."""
+
+
+small_chunks = mock.patch("srl_jax.replay.CHUNK_BYTES", 200_000)
+"""Cuts the frames of such a run into several files; one that is resumed needs what it began with."""
+
+
+def train_here(*arguments):
+    """`experiments.train` in this process; returns its status, raises what it raises."""
+    values = flags.FlagValues()
+    train.define_flags(values)
+    config_flags.parse(["train", *config_flags.last_of_each(arguments)], values)
+    return train.train(values)
+
+
+@pytest.fixture(scope="session")
+def small_run(tmp_path_factory):
+    """The directory of a small run of 160 env steps that can be resumed, and is not to be changed."""
+    run = tmp_path_factory.mktemp("small") / "run"
+    with small_chunks:
+        assert train_here(*SMALL_RUN, "--steps=160", f"--out={run}") == 0
+    return run
+
+
 def rows_of(run):
     """The rows of a run, or of its seeds, less what depends on the clock."""
     files = sorted([*run.glob("metrics.jsonl"), *run.glob("seed*/metrics.jsonl")])
@@ -92,8 +131,6 @@ def remains(run):
     The checkpoint of a run that has ended holds parameters, optimizer, replay with priorities, generators of
     random numbers and environments.
     """
-    from srl_jax import checkpoint
-
     found = {"rows": rows_of(run)}
     for folder in sorted(path.parent for path in run.glob("**/config.json")):
         last = checkpoint.newest_good(folder, pytest.fail)

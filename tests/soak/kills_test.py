@@ -55,15 +55,20 @@ def flags_of(kind):
     return last_of_each((*SMALL, f"--game={kind.split(',')[0]}", *KINDS[kind]))
 
 
+def command(out, flags, at=""):
+    """The command line that starts or resumes a run; see `tests/soak/victim.py`."""
+    return [sys.executable, "-m", "tests.soak.victim", str(at), *flags, f"--out={out}", "--resume=auto"]
+
+
 def life(out, flags, at="", after=None):
     """Starts or resumes a run; kills it at an operation, or so many seconds after it has begun.
 
     Returns:
         Its exit status, and the seconds that it took once it had begun.
     """
-    command = [sys.executable, "-m", "tests.soak.victim", str(at), *flags, f"--out={out}", "--resume=auto"]
+    line = command(out, flags, at)
     with open(f"{out}.errors", "w+") as errors:
-        process = subprocess.Popen(command, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=errors)
+        process = subprocess.Popen(line, cwd=ROOT, env=ENVIRONMENT, stdout=subprocess.PIPE, stderr=errors)
         process.stdout.readline()  # "begun"
         began = time.monotonic()
         try:
