@@ -60,7 +60,7 @@ lint: install ## check style and formatting
 
 soak: install ## try to break what is promised about killed runs, disks and inputs (two hours and more)
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[soak]'
-	@$(VENV)/bin/python -m experiments.soaking $(ARGS)
+	@$(VENV)/bin/python -m pytest tests/soak $(ARGS)
 
 bench: install ## time this project beside PyTorch and Tianshou, and print a table (ten minutes)
 	@$(VENV)/bin/python -m experiments.benchmarks.bench $(ARGS)

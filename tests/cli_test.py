@@ -276,7 +276,6 @@ def test_a_later_flag_of_a_name_replaces_an_earlier_one():
         ("sweep", "presets", "separate values with commas"),
         ("figures", "games", "separate values with commas"),
         ("reference_policies", "games", "separate values with commas"),
-        ("soaking", "only", "separate values with commas"),
         ("benchmarks.bench", "rounds", "give it once"),
     ],
 )

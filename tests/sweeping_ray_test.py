@@ -1,4 +1,4 @@
-"""experiments/sweeping/ray_launcher.py: what a worker does; `experiments.soaking` has a cluster."""
+"""experiments/sweeping/ray_launcher.py: what a worker does; `tests/soak/cluster_test.py` has a cluster."""
 
 import importlib.util
 import json
