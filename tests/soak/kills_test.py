@@ -89,19 +89,18 @@ def test_a_killed_run_ends_as_if_it_had_not_been(kind, tmp_path, amount, progres
     alone = remains(tmp_path / "alone")
     operations = int(Path(f"{tmp_path}/alone.operations").read_text())
     wanted = math.ceil(amount("kills") / len(KINDS))
-    kills, at_operations, wrong = 0, 0, []
-    runs = 0
+    kills, at_operations, runs, wrong = 0, 0, 0, []
     while kills < wanted:
-        out, runs = tmp_path / f"killed_{runs}", runs + 1
-        status = -signal.SIGKILL
-        while status:
-            fault = draw.random() < 0.5
-            if fault:
-                status, _ = life(out, flags, at=draw.randrange(operations // 2))
-            else:
-                status, _ = life(out, flags, after=draw.uniform(0.0, 0.5 * seconds))
+        out, runs, status = tmp_path / f"killed_{runs}", runs + 1, None
+        while status != 0:
+            at, after = "", None
+            if kills < wanted and draw.random() < 0.5:
+                at = draw.randrange(operations // 2)
+            elif kills < wanted:
+                after = draw.uniform(0.0, 0.5 * seconds)
+            status, _ = life(out, flags, at, after)
             kills += status != 0
-            at_operations += fault and status != 0
+            at_operations += status != 0 and at != ""
             progress(kills, wanted, "kills")
         wrong += different(remains(out), alone)
     record_property("SIGKILLs", kills)
