@@ -72,7 +72,7 @@ def life(out, flags, at="", after=None):
         process.stdout.readline()  # "begun"
         began = time.monotonic()
         try:
-            process.communicate(timeout=600 if after is None else after)
+            process.communicate(timeout=after)
         except subprocess.TimeoutExpired:
             process.kill()
             process.communicate()
