@@ -3,6 +3,7 @@
 Entry points define their flags with these functions; the library defines none. Imports no jax.
 """
 
+import contextlib
 import functools
 import logging
 import os
@@ -286,7 +287,9 @@ def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = No
         raise ConfigError(f"--{flag}={text}: must end in {suffix}")
     check_name(flag, text)
     try:
-        there = os.path.lexists(path)
+        there = False
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            there = bool(path.lstat())  # os.path.lexists takes a name that is too long for one that is free
         if there and not overwrite:
             hint = "" if overwrite is None else ", or --overwrite replaces it"
             raise ConfigError(f"--{flag}={text}: exists; name a new file{hint}")
