@@ -1,9 +1,14 @@
 """Command lines: values generated from what a flag says of itself, specifications, contradictions."""
 
+import re
+import sys
+
 import pytest
 
-from experiments.flags import MOVED
+from experiments import train
+from experiments.flags import MOVED, fail
 from srl_jax.config import INFOS
+from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
 from tests.malformed.conftest import CODE, EVALUATE, GIVEN, START, TRAIN
 
@@ -161,3 +166,31 @@ def test_a_source_is_not_overwritten(refused, source):
     refused(*GIVEN, "--game=CatchDistractor", names="--policy_from")
     for command in (START, GIVEN):
         refused(*command, "--out=source", "--overwrite", names="--overwrite would delete")
+
+
+# The check itself
+
+
+@pytest.mark.parametrize(
+    ("does", "seen"),
+    [
+        (lambda folder: 0, "(0, '')"),
+        (lambda folder: (folder / "new").touch(), "=="),
+        (lambda folder: print("{}"), r"(2, '{}\n')"),
+        (lambda folder: sys.stderr.write("two\nlines\n"), "two"),
+        (lambda folder: sys.stderr.write("\x1b[31m"), "isprintable"),
+    ],
+)
+def test_what_is_not_refused_is_noticed(does, seen, folder, refused, monkeypatch):
+    def mistaken(*_):
+        if does(folder) == 0:
+            return 0
+        raise ConfigError("--out: no")
+
+    monkeypatch.setattr(train, "train", mistaken)
+    with pytest.raises(AssertionError, match=re.escape(seen)):
+        refused(*TRAIN, names="--out")
+    monkeypatch.setattr(train, "train", lambda *_: fail("--steps: no"))
+    with pytest.raises(AssertionError, match="--out"):
+        refused(*TRAIN, names="--out")
+    refused(*TRAIN, names="--steps")

@@ -1,5 +1,6 @@
 """What a long run costs: its memory does not grow, and its checkpoints and its resumption are cheap."""
 
+import dataclasses
 import os
 import time
 from unittest import mock
@@ -82,7 +83,7 @@ def test_checkpoints_and_resuming_are_cheap(tmp_path, amount, progress, record_p
     own |= {"diagnostics": False, "eps_final": 1.0}
     filling = {"buffer_size": 2 * every, "steps": steps, "checkpoint_every": every, "keep_replay": True}
     filling |= {"updates_per_step": 1e-4, "learn_start": every}
-    full = Config(**{**vars(config), **own, **filling})
+    full = dataclasses.replace(config, **own, **filling)
     times = []
 
     def each(done):
@@ -104,7 +105,7 @@ def test_checkpoints_and_resuming_are_cheap(tmp_path, amount, progress, record_p
         assert train_here(*flags, "--tune_runtime=off") == 0
     resumed = times[0] - began
 
-    training = Config(**{**vars(config), **own, "steps": 300 * per, "learn_start": 50 * per})
+    training = dataclasses.replace(config, **own, steps=300 * per, learn_start=50 * per)
     times.clear()
     with Watch(training, each):
         srl_jax.train(training, tmp_path / "training", progress=False)

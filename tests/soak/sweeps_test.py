@@ -15,6 +15,7 @@ import time
 from pathlib import Path
 
 from srl_jax import checkpoint, ending
+from tests.helpers import write_checkpoint, write_run
 from tests.soak.conftest import ROOT, rows_of
 
 SMALL = (
@@ -137,3 +138,20 @@ def test_a_killed_sweep_ends_with_the_same_figures(tmp_path, amount, say, record
     record_property("figures and their numbers, equal byte for byte", len(files))
     different = [name for name in files if (alone / name).read_bytes() != (killed / name).read_bytes()]
     assert files and not different
+
+
+def test_a_difference_between_two_sweeps_is_found(tmp_path):
+    name, roots = "Catch/rl_only/seed0", (tmp_path / "alone", tmp_path / "other")
+    done = ending.Ending("finished", 240)
+    for root in roots:
+        write_checkpoint(write_run(root / name, ended=done))
+    assert runs_of(roots[1]) == [name] and differing(*roots, name) == []
+    log = roots[1] / "logs" / f"{name}.log"
+    log.parent.mkdir(parents=True)
+    log.write_text("240 env steps; everything is in it\n" * 2)
+    (roots[1] / name / "ended.json").unlink()
+    (roots[1] / name / "metrics.jsonl").write_text("")
+    write_checkpoint(roots[1] / name, only=["rl"])
+    assert differing(*roots, name) == [
+        "metrics.jsonl differs", "the last checkpoint differs", "not complete", "run to its end 2 times",
+    ]  # fmt: skip
