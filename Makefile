@@ -20,7 +20,7 @@ unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
 # Tests that start few processes and compile little, half a minute in all.
 FAST := actor arms augment colours config control_groups curves data docs ending envs_base help metrics \
-	optim progress reading replay rl_losses rundir specs statistics sumtree \
+	optim progress reading replay replay_machine rl_losses rundir specs statistics sumtree \
 	sweeping_plan sweeping_table window
 
 .DEFAULT_GOAL := help
