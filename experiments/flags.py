@@ -3,6 +3,7 @@
 Entry points define their flags with these functions; the library defines none. Imports no jax.
 """
 
+import contextlib
 import functools
 import logging
 import os
@@ -284,7 +285,10 @@ def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = No
     def problem(path: Path) -> str:
         if path.suffix.lower() != suffix:
             return f"must end in {suffix}"
-        if (there := os.path.lexists(path)) and not overwrite:
+        there = False
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            there = bool(path.lstat())  # os.path.lexists takes a name that is too long for one that is free
+        if there and not overwrite:
             hint = "" if overwrite is None else ", or --overwrite replaces it"
             return f"exists; name a new file{hint}"
         if there and not path.is_file():

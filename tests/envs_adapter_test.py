@@ -8,10 +8,10 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 
-from experiments.soaking.snapshots import MOMENTS, Player, goes_on
 from srl_jax import envs
 from srl_jax.envs import adapter, games, pixels
 from srl_jax.errors import ConfigError
+from tests.players import MOMENTS, Player, goes_on
 
 
 class Square(gymnasium.Env):

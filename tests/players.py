@@ -1,31 +1,8 @@
-"""Snapshots of environments: a new one goes on as the old one does."""
+"""Random players of environments, and whether a new environment goes on from a snapshot as the old one."""
 
 from collections.abc import Callable, Mapping
 
 import numpy as np
-
-from srl_jax import envs
-from srl_jax.display import Progress
-
-from . import Count, Say
-
-NOOP_MAX = 30
-ODD_GAMES = ("Breakout", "Qbert", "YarsRevenge", "Seaquest", "Pong")
-"""Several lives; remember the past; score against another player."""
-
-
-class Lines:
-    """The stream of a Progress whose lines somebody else takes."""
-
-    def __init__(self, say: Say):
-        self._say = say
-
-    def write(self, text: str) -> None:
-        if text.strip():
-            self._say(text.strip())
-
-    def flush(self) -> None:
-        pass
 
 
 class Player:
@@ -133,38 +110,3 @@ def same(a: list, b: list) -> bool:
 def identical(a: Mapping, b: Mapping) -> bool:
     """Whether two snapshots are the same, dtypes included."""
     return set(a) == set(b) and all(a[n].dtype == b[n].dtype and np.array_equal(a[n], b[n]) for n in a)
-
-
-def out_of_snapshots(short: bool, say: Say) -> list[Count]:
-    """Snapshots of Atari at random moments, restored in new environments, beside the old ones for 200 moves.
-
-    All 57 games, and some of them with and without sticky actions and no-ops, after a step, a reset and an
-    end. Episodes are cut after 40 steps and environments reseeded after 60, so that the logs that are played
-    again hold resets and begin at different times.
-    """
-    both = (0.0, 0.25), (0, NOOP_MAX)
-    cases = [(game, s, n, m) for game in ODD_GAMES for s in both[0] for n in both[1] for m in MOMENTS]
-    cases += [
-        (game, both[0][i % 2], both[1][i // 2 % 2], list(MOMENTS)[i % 3])
-        for i, game in enumerate(envs.ATARI_57)
-    ]
-    cases, number, moves = (cases[1:2], 2, 40) if short else (cases, 3, 200)
-    failed = events = 0
-    with Progress(len(cases), "snapshots", stream=Lines(say)) as progress:
-        for index, (game, sticky, noops, moment) in enumerate(cases):
-            options = {"sticky_actions": sticky, "noop_max": noops, "max_frames": 160, "reseed_every": 60}
-
-            def make(game=game, options=options):
-                return envs.make(game, num_envs=number, seed=1, frame_size=42, **options)
-
-            player = Player.start(make(), index)
-            player.moves(int(player.rng.integers(50, 150)))
-            difference, snapshot = goes_on(player, make, player.until(moment), moves)
-            player.env.close()
-            if difference:
-                failed += 1
-                progress.note(f"{game}, sticky_actions={sticky}, noop_max={noops}, {moment}: {difference}")
-            events += len(snapshot["events"])
-            progress.update(index + 1, game=game)
-    detail = f"{number} environments each; {events:,} steps and resets played again"
-    return [Count(f"snapshots restored, then {moves} moves beside the original", len(cases), failed, detail)]

@@ -1,21 +1,12 @@
-"""The soak parts about emulators: they pass in short, and each notices what it is there for."""
+"""tests/recorder.py: a run's replay and policy see what its environments gave; a Recorder notices if not."""
 
 import numpy as np
 import pytest
 
-from experiments.soaking import snapshots
-from srl_jax import envs
 from srl_jax.replay import Replay
-
-pytest.importorskip("ale_py")
-
-from experiments.soaking import emulators  # noqa: E402
+from tests.recorder import Recorder, Watched
 
 N, SIZE, STACK, GAMMA = 3, 18, 4, 0.99
-
-
-def failed(counts):
-    return [count.failed for count in counts]
 
 
 class Game:
@@ -53,7 +44,7 @@ class Game:
 
 def played(steps=60, slots=30):
     """A record of a game, and a replay that got the same."""
-    record = emulators.Recorder(Game(), steps)
+    record = Recorder(Game(), steps)
     replay = Replay(capacity=N * slots, num_streams=N, frame_shape=(SIZE, SIZE, 1), stack=STACK, gamma=GAMMA)
     replay.begin(record.reset()[0])
     rng = np.random.default_rng(1)
@@ -68,23 +59,13 @@ def played(steps=60, slots=30):
     return record, replay
 
 
-def test_against_gymnasium(monkeypatch):
-    pytest.importorskip("cv2")
-    assert failed(emulators.against_gymnasium(True, lambda line: None)) == [0, 0]
-    # The rules are needed: without the no-ops that they predict, every frame is another one.
-    monkeypatch.setattr(emulators, "THREE_GAMES", ("Freeway",))
-    monkeypatch.setattr(emulators, "TWISTER", lambda seed: np.random.RandomState(seed + 1))
-    frames, numbers = emulators.against_gymnasium(True, lambda line: None)
-    assert frames.failed > frames.number / 2 and numbers.failed > numbers.number / 2
-
-
-def test_through_the_loop(tmp_path):
-    said = []
-    counts = emulators.through_the_loop(True, tmp_path, said.append)
-    assert failed(counts) == [0] * 5
-    assert [count.number for count in counts[:2]] == [1800, 1800]
-    assert all(count.number > 1000 for count in counts)
-    assert "1,800/1,800 env steps" in said[-1]
+def test_a_run_sees_what_its_environments_gave(tmp_path):
+    pytest.importorskip("ale_py")
+    watched = Watched("Breakout", num_envs=3, slots=30, max_steps=20, reseed_every=100)
+    counts = watched.run(tmp_path / "run", steps=200, seed=0)
+    assert counts["env steps"] == 600 and counts["episodes cut"] > 10
+    assert counts["windows"] > 3000 and counts["transitions seen"] > 590
+    assert [counts[name] for name in watched.WRONG] == [0] * 5
 
 
 def test_a_record_knows_the_windows_of_its_replay():
@@ -137,7 +118,7 @@ def test_a_record_notices_wrong_stacks():
 
 def test_a_record_notices_phantoms_and_early_resets():
     game = Game()
-    record = emulators.Recorder(game, 10)
+    record = Recorder(game, 10)
     record.reset()
     record.step(np.zeros(N, int))
     assert record.phantoms == 0
@@ -149,21 +130,3 @@ def test_a_record_notices_phantoms_and_early_resets():
     record._ended = np.array([False, True, False])
     record.reset(options={"reset_mask": np.array([True, True, False])})
     assert record.wrong_resets == before + 1
-
-
-def test_out_of_snapshots():
-    assert failed(snapshots.out_of_snapshots(True, lambda line: None)) == [0]
-
-
-def test_two_environments_that_differ_are_noticed():
-    def make(seed=0):
-        return envs.make("Catch", num_envs=2, seed=seed, frame_size=42)
-
-    class Forgets(type(make())):
-        def _restore(self, arrays):
-            return super()._restore(arrays | {"episodes": arrays["episodes"] + 1})
-
-    player = snapshots.Player.start(make(), 0)
-    forgets = lambda: Forgets(num_envs=2, seed=0, size=42)  # noqa: E731
-    difference, _ = snapshots.goes_on(player, forgets, player.until("after a step"), 40)
-    assert difference == "a second snapshot differs"
