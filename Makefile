@@ -19,9 +19,9 @@ STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
 # Tests that start few processes and compile little, half a minute in all.
-FAST := actor arms augment colours config control_groups curves data docs ending envs_base help metrics \
-	optim progress reading replay rl_losses rundir specs statistics sumtree \
-	sweeping_plan sweeping_table window
+FAST := actor arms augment colours compare config control_groups data docs ending envs_base help metrics \
+	optim plots reading replay replay_machine rl_losses run_data rundir specs statistics sumtree \
+	sweeping_plan sweeping_status window
 
 .DEFAULT_GOAL := help
 .PHONY: help install check test train lint soak bench bench-gpu bench-install
@@ -58,9 +58,9 @@ train: install ## train on Pong for about three minutes (two cores), into a new 
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .
 
-soak: install ## try to break what is promised about killed runs, disks and inputs (two hours and more)
+soak: install ## try to break what is promised about killed runs, disks and inputs (two hours)
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[soak]'
-	@$(VENV)/bin/python -m experiments.soaking $(ARGS)
+	@$(VENV)/bin/python -m pytest $(if $(findstring tests/soak,$(ARGS)),,tests/soak) $(ARGS)
 
 bench: install ## time this project beside PyTorch and Tianshou, and print a table (ten minutes)
 	@$(VENV)/bin/python -m experiments.benchmarks.bench $(ARGS)

@@ -32,6 +32,7 @@ COMMANDS: dict[str, Command] = {
     "figures": Command("run and draw a figure", "--figure=6.3 --games=Catch"),
     "report": Command("write a page about many runs", "runs --out=report.html"),
     "draw": Command("draw the figures of a run again", "runs/x"),
+    "compare": Command("draw the curves of several runs", "runs/a runs/b --out=ab.png"),
     "export": Command("write a run's encoder to a file for numpy", "runs/x --encoder=enc.npz"),
 }
 """What follows `srl-jax`, in the order in which it is listed."""

@@ -11,18 +11,20 @@ from pathlib import Path
 import numpy as np
 
 from srl_jax import statistics
-from srl_jax.config import INFOS, difference
+from srl_jax.config import INFOS, Config, difference
+from srl_jax.data import Published, ReferencePolicy
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 
 from . import packing
-from .directories import natural
-from .run_data import RunData, arm_name, load_run, run_directories
+from .run_data import RunData, arm_name, in_order, load_run, run_directories
 
+RETURN = "eval/return_mean"
+"""The key of learning curves."""
 PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
-OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports")
+OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", "loggers")
 """Fields in which runs of one arm and game may differ."""
 
 
@@ -47,8 +49,7 @@ def load_runs(*roots: str | Path) -> list[RunData]:
     read: list[RunData] = []
     for path in files.values():
         read += packing.read(path.parent) if path.name == packing.CONFIGS else [load_run(path.parent)]
-    runs = _each_once(read)
-    return [runs[key] for key in sorted(runs, key=lambda key: (key[0], natural(key[1]), key[2]))]
+    return in_order(_each_once(read))
 
 
 def load_named(root: Path, names: Iterable[str]) -> list[RunData]:
@@ -65,19 +66,23 @@ def load_named(root: Path, names: Iterable[str]) -> list[RunData]:
     found = [load_run(path) for path in places if (path / "config.json").exists()]
     if packing.is_packed(root):
         found += [run for run in packing.read(root) if run.path in places]
-    return sorted(_each_once(found).values(), key=lambda run: places.index(run.path))
+    return sorted(_each_once(found), key=lambda run: places.index(run.path))
 
 
-def _each_once(runs: Iterable[RunData]) -> dict[tuple, RunData]:
-    """{(game, arm, seed): the run}."""
+def _each_once(runs: Sequence[RunData]) -> Sequence[RunData]:
+    """The runs.
+
+    Raises:
+        ConfigError: two are of the same game, arm and seed.
+    """
     found: dict[tuple, RunData] = {}
     for run in runs:
-        other = found.setdefault((run.game, run.arm, run.seed), run)
+        other = found.setdefault(run.key, run)
         if other is not run:
             raise ConfigError(
                 f"{run.path}: the same game, arm and seed as {other.path}; move one of them away"
             )
-    return found
+    return runs
 
 
 def arm_names(root: Path) -> list[str]:
@@ -94,11 +99,21 @@ def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:
     return groups
 
 
+def steps_and_values(run: RunData, key: str) -> tuple[np.ndarray, np.ndarray]:
+    """Env steps int64 [N], ascending, and a key's values float64 [N], of rows where it is not null.
+
+    Raises:
+        ConfigError: a value is no number.
+    """
+    found = {row["env_steps"]: row[key] for row in run.rows if row.get(key) is not None}
+    if not all(isinstance(value, int | float) for value in found.values()):
+        raise ConfigError(f"{run.path}: {key} is not a number in each row")
+    return np.array(list(found), np.int64), np.array(list(found.values()), np.float64)
+
+
 def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
-    """The learning curve: env steps int64 [N], ascending, and mean evaluation returns float64 [N]."""
-    rows = [row for row in run.rows if row["kind"] == "eval" and row.get("eval/return_mean") is not None]
-    steps = np.array([row["env_steps"] for row in rows], np.int64)
-    return steps, np.array([row["eval/return_mean"] for row in rows], np.float64)
+    """The learning curve, `steps_and_values` of mean evaluation returns."""
+    return steps_and_values(run, RETURN)
 
 
 def ends(curves: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str, np.ndarray]:
@@ -120,23 +135,24 @@ def has_policy(run: RunData) -> bool:
     return MODES[run.config.mode].rl
 
 
-def comparable(runs: Sequence[RunData]) -> list[RunData]:
-    """Runs whose learning curves can be laid beside each other, in their order; the others, `left_out` has.
+def comparable(runs: Sequence[RunData], key: str = RETURN) -> list[RunData]:
+    """Runs whose curves of a key can be laid beside each other, in their order; the others, `left_out` has.
 
     One that ended with an error is left out however far it got, one without evaluations, and one with a
     single evaluation where others of its game have more: it has only just begun. Each would cut the curves of
     all others down to where it is.
     """
-    return [run for run, why in zip(runs, _why_not(runs), strict=True) if not why]
+    return [run for run, why in zip(runs, _why_not(runs, key), strict=True) if not why]
 
 
-def left_out(runs: Sequence[RunData]) -> list[tuple[RunData, str]]:
-    """The runs with a policy that are not `comparable`, and why."""
-    return [(run, why) for run, why in zip(runs, _why_not(runs), strict=True) if why and has_policy(run)]
+def left_out(runs: Sequence[RunData], key: str = RETURN) -> list[tuple[RunData, str]]:
+    """The runs that are not `comparable`, and why; of returns, those with a policy."""
+    whys = zip(runs, _why_not(runs, key), strict=True)
+    return [(run, why) for run, why in whys if why and (key != RETURN or has_policy(run))]
 
 
-def _why_not(runs: Sequence[RunData]) -> list[str]:
-    points = [0 if run.failed else len(steps_and_returns(run)[0]) for run in runs]
+def _why_not(runs: Sequence[RunData], key: str) -> list[str]:
+    points = [0 if run.failed else len(steps_and_values(run, key)[0]) for run in runs]
     under_way = {run.game for run, count in zip(runs, points, strict=True) if count > 1}
     found = []
     for run, count in zip(runs, points, strict=True):
@@ -144,7 +160,7 @@ def _why_not(runs: Sequence[RunData]) -> list[str]:
         if run.failed:
             why = run.ended.reason
         elif count == 0:
-            why = "not evaluated yet"
+            why = "not evaluated yet" if key == RETURN else f"has no {key}"
         elif count == 1 and run.game in under_way:
             why = "has only begun"
         found.append(why)
@@ -206,3 +222,47 @@ def check_protocols(runs: Sequence[RunData], *, force: bool = False) -> list[str
     if found and not force:
         raise ConfigError(f"{found[0]}; --force compares them all the same")
     return found
+
+
+def differs(
+    score: Published | ReferencePolicy, config: Config, env_steps: int | None = None, seeds: int | None = None
+) -> str:
+    """What differs between the score of others, or of a policy that learns nothing, and a run's evaluations.
+
+    Args:
+        score: from `srl_jax.data`.
+        config: of the run.
+        env_steps: when the run was evaluated; by default at its end.
+        seeds: runs that its score is the mean of; None leaves them out.
+
+    Returns:
+        "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not
+        known: sticky actions, seeds", say, to be shown beside both; "" if nothing differs.
+    """
+    compared: dict[str, tuple[float | None, float | None]]
+    compared = {"sticky actions": (score.sticky_actions, config.sticky_actions)}
+    more, unknown, source = [], [], ""
+    if isinstance(score, ReferencePolicy):
+        if score.episodes is None:
+            source = f"published, {score.source}"
+        else:  # None: the game has no such thing
+            names = ("sticky_actions", "noop_max", "eval_max_steps")
+            pairs = {name.replace("_", " "): (getattr(score, name), getattr(config, name)) for name in names}
+            compared = {name: pair for name, pair in pairs.items() if pair[0] is not None}
+    else:
+        if score.env_steps is not None:
+            compared["env steps"] = score.env_steps, config.steps if env_steps is None else env_steps
+            compared["epsilon"] = score.epsilon, config.eps_eval
+            compared["seeds"] = score.seeds, score.seeds if seeds is None else seeds
+        if score.score_of is None:
+            unknown = ["kind of score"]
+        elif score.score_of != "evaluation":
+            more = [f"{score.score_of} score (here the mean of {config.eval_games} evaluation games)"]
+    texts = [
+        f"{name} {there:,} (here {here:,})"
+        for name, (there, here) in compared.items()
+        if there not in (None, here)
+    ]
+    unknown = [name for name, (there, _) in compared.items() if there is None] + unknown
+    parts = [source, ", ".join(texts + more), f"not known: {', '.join(unknown)}" if unknown else ""]
+    return "; ".join(part for part in parts if part)

@@ -10,8 +10,9 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 
 from .arms import FIGURES
-from .plots import COLOURS
 
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
+"""Okabe and Ito's palette: distinguishable to colour-blind readers."""
 LINES = ("-", "--", ":")
 """Of arms that have the same colour."""
 Style = tuple[str, str]
@@ -25,20 +26,16 @@ def styles(arms: Sequence[str], among: Iterable[str] = ()) -> dict[str, Style]:
         arms: that are drawn together; where a colour comes again, the line is another one.
         among: all arms of the directory: they decide colours, too.
     """
-    colours = _colours({*arms, *among})
+    there = {*arms, *among}
+    colours = {arm: colour for arm, colour in _thesis().items() if arm in there}
+    for arm in sorted(there - colours.keys()):
+        colours[arm] = _rarest(COLOURS, list(colours.values()))
     used: Counter[str] = Counter()
     found = {}
     for arm in dict.fromkeys(arms):
         colour = colours[arm]
         found[arm] = colour, LINES[used[colour] % len(LINES)]
         used[colour] += 1
-    return found
-
-
-def _colours(arms: set[str]) -> dict[str, str]:
-    found = {arm: colour for arm, colour in _thesis().items() if arm in arms}
-    for arm in sorted(arms - found.keys()):
-        found[arm] = _rarest(COLOURS, list(found.values()))
     return found
 
 

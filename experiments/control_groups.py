@@ -52,6 +52,19 @@ def _unescaped(text: str) -> str:
     return re.sub(r"\\([0-7]{3})", lambda match: chr(int(match[1], 8)), text)
 
 
+def free_memory(root: Path = ROOT) -> int | None:
+    """The bytes that new processes can have, also under a group's limit; None where that is not known.
+
+    Args:
+        root: of the file system; another one for tests.
+    """
+    found = [free_bytes(root)]
+    with contextlib.suppress(OSError, ValueError, IndexError, StopIteration):
+        lines = (root / "proc/meminfo").read_text().splitlines()
+        found.append(next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:")))
+    return min((size for size in found if size is not None), default=None)
+
+
 def free_bytes(root: Path = ROOT) -> int | None:
     """The memory that the groups leave to new processes; None where they set no limit.
 

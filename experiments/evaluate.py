@@ -90,9 +90,9 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         "lengths": played.lengths,
     }
     if FLAGS.gif:
-        from . import plots
+        from . import images
 
-        plots.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
+        images.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
     display.result(json.dumps(result))
 
 

@@ -1,8 +1,9 @@
 """Writes a run's encoder to a file that numpy can read: `srl-jax export runs/x --encoder=enc.npz`.
 
 Each parameter is an array by its name, as Conv_0/kernel; "about" is a JSON text: the specification of the
-encoder, the shape of an observation, the size of the latent, the game, the env steps. A run's newest
-checkpoint is meant; one of them, its best/ and what is kept in its encoders/ can be named, too.
+encoder, the shape of an observation, the size of the latent, the game, the env steps, and the steps that the
+encoder computes, with strides, padding and epsilon (see srl_jax/encoders/files.py). A run's newest checkpoint
+is meant; one of them, its best/ and what is kept in its encoders/ can be named, too.
 srl_jax.encoders.from_npz loads the file.
 """
 

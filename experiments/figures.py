@@ -24,11 +24,12 @@ from srl_jax.data import published, reference_policies
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.specs import choices_text
 
-from . import collect, curves, packing, plots, sweep
+from . import collect, packing, plots
 from . import flags as config_flags
 from .arms import FIGURES, Figure, figures_named
 from .collect import RunData, comparable, steps_and_returns
 from .colours import styles
+from .sweeping import launching, manifest, options, status
 from .sweeping.plan import Arm, Planned, parse_seeds, plan
 
 FLAGS = flags.FLAGS
@@ -120,7 +121,7 @@ def evaluated(
             entry["arms"][name] = values
         config = next(iter(members.values()))[0].config
         entry["policies"] = {
-            name: {"mean": row.return_mean, "differs": row.differs_from(config), "source": row.source}
+            name: {"mean": row.return_mean, "differs": collect.differs(row, config), "source": row.source}
             for name, row in reference_policies(game).items()
         }
         entry["published"] = [level._asdict() for level in published_levels(game, methods, config, until)]
@@ -146,7 +147,7 @@ def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.nd
     return found | {"probability_of_improvement": _limits(better)}
 
 
-def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[curves.Level]:
+def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[plots.Level]:
     """Published scores as lines that say what differs from these runs.
 
     Args:
@@ -160,7 +161,7 @@ def published_levels(game: str, methods: Sequence[str], config: Config, until: i
         found = [entry for entry in published(game) if entry.method == method]
         if found:
             entry = min(found, key=lambda entry: abs((entry.env_steps or 0) - until))
-            levels.append(curves.Level(method, entry.score, entry.differs_from(config, until)))
+            levels.append(plots.Level(method, entry.score, collect.differs(entry, config, until)))
     return levels
 
 
@@ -178,11 +179,11 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
         for arm in figure.arms:
             if (values := entry["arms"].get(arm.name)) is not None:
                 limits = (np.array(values[key], float) for key in ("mean", "low", "high"))
-                seeds, thesis = len(values["seeds"]), arm.thesis_curve(game)
-                lines.append(curves.Line(arm.name, values["env_steps"], *limits, seeds, thesis))
-        policies = [curves.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
-        levels = [curves.Level(**level) for level in entry["published"]]
-        panels.append(curves.Panel(game, lines, levels, policies))
+                curve = plots.Curve(values["env_steps"], *limits)
+                lines.append(plots.Line(arm.name, curve, len(values["seeds"]), arm.thesis_curve(game)))
+        policies = [plots.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
+        levels = [plots.Level(**level) for level in entry["published"]]
+        panels.append(plots.Panel(game, lines, levels, policies))
     kinds = {arm["kind"] for entry in numbers["games"].values() for arm in entry["arms"].values()}
     kinds = ", ".join(sorted(kinds - {statistics.NONE}))
     note = f"bands: 95 % intervals over seeds at each point, {kinds}" if kinds else "single seeds: no bands"
@@ -192,7 +193,7 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
         note += "; PROTOCOLS DIFFER between runs"
     looks = {arm: tuple(style) for arm, style in numbers["styles"].items()}
     note = "\n".join([note, *left_out_lines(numbers)])
-    return curves.comparison(panels, path, f"{figure.name}  {figure.title}", note, looks)
+    return plots.draw_panels(panels, path, f"{figure.name}  {figure.title}", note, looks)
 
 
 def left_out_lines(numbers: Mapping[str, Any]) -> list[str]:
@@ -222,8 +223,7 @@ def _plain(values: Any) -> Any:
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    config_flags.define_config_flags(values)
-    config_flags.define_runtime_flag(values)
+    options.define_flags(values)
     flags.DEFINE_string(
         "figure",
         None,
@@ -233,7 +233,6 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_list("games", ["Pong"], "to run each arm on; a panel each", flag_values=values)
     flags.DEFINE_string("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,", flag_values=values)
     flags.DEFINE_string("out", "runs/figures", "directory of runs and figures", flag_values=values)
-    sweep.define_launcher_flags(values)
     flags.DEFINE_string(
         "published",
         "Human,Dopamine Rainbow",
@@ -269,32 +268,33 @@ def run(values: flags.FlagValues) -> int:
         raise ConfigError(
             f"--out={out}: its runs are packed; draw them with --redraw, or name another directory"
         )
-    options = sweep.launcher_options(values)
+    how = options.launcher_options(values)
     seeds, games = (
         parse_seeds(values["seeds"].value),
         envs.several(values["games"].value, others=bool(values["import"].value)),
     )
-    runs = planned(figures, games, seeds, sweep.given_flags(values))
-    sweep.say_what_is_replaced(values, runs)
+    runs = planned(figures, games, seeds, options.given_flags(values))
+    options.say_what_is_replaced(values, runs)
     methods = _known(values["published"].value)
     if values["dry_run"].value:
-        display.result("\n".join(sweep.dry_run(root, runs, **options)))
+        workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
+        display.result("\n".join(status.dry_run(root, manifest.resolve(runs), workers)))
         return 0
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
-    status = 0
+    code = 0
     try:
         if not values["redraw"].value:
-            status = sweep.run_sweep(root, runs, **options).status
-            if status >= 128:  # told to end
-                return status
+            code = launching.run_sweep(root, manifest.resolve(runs), **how)
+            if code >= 128:  # told to end
+                return code
         read = collect.load_named(root, [run.name for run in runs])
-        how = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
+        asked = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
         for figure in figures:
-            print(write(figure, read, games, root / "figures", **how))
+            print(write(figure, read, games, root / "figures", **asked))
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error
-    return status
+    return code
 
 
 def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directory: Path, **how: Any) -> Path:

@@ -3,9 +3,11 @@
 Entry points define their flags with these functions; the library defines none. Imports no jax.
 """
 
+import contextlib
 import functools
 import logging
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -13,7 +15,7 @@ from typing import Any, NoReturn
 
 from absl import app, flags
 
-from srl_jax import display, modes, plugins, specs
+from srl_jax import display, loggers, modes, plugins, specs
 from srl_jax.config import INFOS, Config, unresolved
 from srl_jax.errors import EXIT_STATUS, ConfigError
 from srl_jax.reading import SETTINGS, read_bytes
@@ -32,6 +34,7 @@ MOVED = {
     **{name: f"--rl=:{name}=..." for name in ("n_step", "v_min", "v_max", "noisy_std", "alpha")},
     "num_atoms": "--rl=:atoms=...",
     "lr_final": "--lr_final_share=...",
+    "tensorboard": "--logger=tensorboard",
 }
 """{flag that there was: how its value is given now}; `--rl=:KEY=...` leaves the other options as they are."""
 
@@ -219,6 +222,8 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
             given[name] = () if texts in (("none",), ("",)) else texts
     if "imports" in given:
         given["imports"] = tuple(map(plugins.located, given["imports"]))
+    if "loggers" in given:
+        given["loggers"] = loggers.listed(given["loggers"])
     if "objectives" in given:
         given["objectives"] = with_objectives(base.get("objectives", ()), given["objectives"])
     for name in ("rl", "encoder"):
@@ -250,23 +255,18 @@ def check_place(flag: str, text: str) -> Path:
     Raises:
         ConfigError: neither holds.
     """
-    check_name(flag, text)
-    path = Path(os.path.expanduser(text))
-    try:
+
+    def problem(path: Path) -> str:
         if path.is_dir():
-            if not os.access(path, os.W_OK | os.X_OK):
-                raise ConfigError(f"--{flag}={text}: no permission to write there")
-            return path
+            return "" if os.access(path, os.W_OK | os.X_OK) else "no permission to write there"
         if os.path.lexists(path):
-            raise ConfigError(f"--{flag}={text}: exists and is not a directory")
+            return "exists and is not a directory"
         parent = next(p for p in path.absolute().parents if os.path.lexists(p))
         if not parent.is_dir():
-            raise ConfigError(f"--{flag}={text}: {parent} is not a directory")
-        if not os.access(parent, os.W_OK | os.X_OK):
-            raise ConfigError(f"--{flag}={text}: no permission to write in {parent}")
-    except OSError as error:
-        raise ConfigError(f"--{flag}={text}: {error.strerror}") from None
-    return path
+            return f"{parent} is not a directory"
+        return "" if os.access(parent, os.W_OK | os.X_OK) else f"no permission to write in {parent}"
+
+    return _checked(flag, text, problem)
 
 
 def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = None) -> Path:
@@ -281,23 +281,37 @@ def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = No
     Raises:
         ConfigError: it has another name, or something lies there, or the directory does not.
     """
-    path = Path(os.path.expanduser(text))
-    if path.suffix.lower() != suffix:
-        raise ConfigError(f"--{flag}={text}: must end in {suffix}")
-    check_name(flag, text)
-    try:
-        there = os.path.lexists(path)
+
+    def problem(path: Path) -> str:
+        if path.suffix.lower() != suffix:
+            return f"must end in {suffix}"
+        there = False
+        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+            there = bool(path.lstat())  # os.path.lexists takes a name that is too long for one that is free
         if there and not overwrite:
             hint = "" if overwrite is None else ", or --overwrite replaces it"
-            raise ConfigError(f"--{flag}={text}: exists; name a new file{hint}")
+            return f"exists; name a new file{hint}"
         if there and not path.is_file():
-            raise ConfigError(f"--{flag}={text}: exists and is not a file")
-        if not path.absolute().parent.is_dir():
-            raise ConfigError(f"--{flag}={text}: no such directory")
-    except (OSError, ValueError) as error:
-        if isinstance(error, ConfigError):
-            raise
-        raise ConfigError(f"--{flag}={text}: {getattr(error, 'strerror', error)}") from None
+            return "exists and is not a file"
+        return "" if path.absolute().parent.is_dir() else "no such directory"
+
+    return _checked(flag, text, problem)
+
+
+def _checked(flag: str, text: str, problem: Callable[[Path], str]) -> Path:
+    """The path that a flag names, if no problem is found with it.
+
+    Raises:
+        ConfigError: there is one, or its name cannot be shown, or the system refuses it.
+    """
+    check_name(flag, text)
+    path = Path(os.path.expanduser(text))
+    try:
+        found = problem(path)
+    except OSError as error:
+        found = str(error.strerror)
+    if found:
+        raise ConfigError(f"--{flag}={text}: {found}")
     return path
 
 
@@ -352,6 +366,7 @@ def parse(
         fail("--flagfile: not taken; write the flags themselves, or use --preset")
     # Else an argument without a name would end the flags.
     values.set_gnu_getopt(positional is not None)
+    own = help.own_flags(values)
     try:
         rest = values(argv)
         if positional and len(rest) > 1 and not values[positional].present:
@@ -359,11 +374,17 @@ def parse(
             values[positional].parse(rest[1:] if several else rest[1])
             del rest[1 : None if several else 2]
     except flags.UnrecognizedFlagError as error:
-        fail(f"--{error.flagname}: {unknown(error.flagname, values)}")
+        fail(f"--{error.flagname}: {unknown(error.flagname, own)}")
     except (flags.Error, ValueError) as error:  # ValueError: a value behind --noNAME
-        fail(str(error).removeprefix("flag "))
+        line = str(error).removeprefix("flag ")
+        several = re.match(r"--((\w+)=[^:\s]+,[^:\s]+): ", line)
+        if several and several[2] in INFOS and "grid" in values:
+            line += f"; --grid {several[1]} tries each"
+        fail(line)
     for name in values:
         flag = values[name]
+        if flag.present and name not in own:
+            fail(f"--{name}: {unknown(name, own)}")
         if flag.present > 1 and not isinstance(flag, flags.MultiFlag):  # absl takes the last one
             hint = "separate values with commas" if isinstance(flag.value, list) else "give it once"
             fail(f"--{name}: given {flag.present} times; {hint}")

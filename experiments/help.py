@@ -22,7 +22,7 @@ GROUPS: dict[str, str] = {
     "max_grad_norm adam_eps",
     "Evaluation": "eval_every eval_games eval_max_steps eps_eval stop_at_return diagnostics diagnostics_kept",
     "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every keep_best keep_replay "
-    "tensorboard print_config tune_runtime",
+    "logger print_config dry_run tune_runtime",
 }
 """Flags of training, in the order in which they are shown; others are a program's own."""
 
@@ -49,7 +49,7 @@ def text(about: str, values: flags.FlagValues) -> str:
         about: what the program does; its first lines are shown.
         values: where its flags are defined. Where --rl is among them, jax is imported for what it may be.
     """
-    own = sorted(n for n in values if not values.find_module_defining_flag(n, "absl").startswith("absl"))
+    own = own_flags(values)
     trains = "rl" in own
     grouped = {title: names.split() for title, names in GROUPS.items()} if trains else {}
     known = {name for names in grouped.values() for name in names}
@@ -63,6 +63,11 @@ def text(about: str, values: flags.FlagValues) -> str:
     if trains:
         lines += ["Presets:", *_presets()]
     return "\n".join(lines).rstrip()
+
+
+def own_flags(values: flags.FlagValues) -> list[str]:
+    """The names of a program's flags, sorted; those that absl has brought along are none of its own."""
+    return sorted(n for n in values if not values.find_module_defining_flag(n, "absl").startswith("absl"))
 
 
 def _flag(name: str, values: flags.FlagValues) -> Iterator[str]:
@@ -85,9 +90,10 @@ def _flag(name: str, values: flags.FlagValues) -> Iterator[str]:
 
 def _rows() -> dict[str, dict[str, dict[str, Any]]]:
     """{flag: {row of its registry: {option: default}}}; imports jax."""
-    from srl_jax import encoders, objectives, rl
+    from srl_jax import encoders, loggers, objectives, rl
 
     registries = {"rl": rl.REGISTRY, "encoder": encoders.REGISTRY, "objective": objectives.REGISTRY}
+    registries["logger"] = loggers.REGISTRY
     return {
         flag: {name: specs.option_defaults(row) for name, row in registry.items()}
         for flag, registry in registries.items()
@@ -99,7 +105,7 @@ def _listed(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     for place, (name, options) in enumerate(rows.items()):
         line = specs.join(name, options)
         for other in list(rows)[:place]:
-            if rows[other].keys() == options.keys():
+            if options and rows[other].keys() == options.keys():
                 differing = {key: x for key, x in options.items() if x != rows[other][key]}
                 line = f"{name}: {specs.join(other, differing)}"
                 break

@@ -17,18 +17,17 @@ from typing import Any
 
 from absl import flags
 
+from srl_jax import config as config_file
 from srl_jax import display, ending
 from srl_jax.config import INFOS, Config
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import parse_row
 from srl_jax.reading import ROWS as MOST_BYTES
-from srl_jax.reading import parse_json, read_bytes, replace_bytes, replace_text
+from srl_jax.reading import read_bytes, read_json, replace_bytes, replace_text
 
 from . import flags as config_flags
-from .directories import natural, runs_below
-from .draw import check_rows
-from .run_data import RunData, load_run, run_directories
+from .run_data import RunData, check_rows, in_order, load_run, run_directories, runs_below
 
 FLAGS = flags.FLAGS
 
@@ -72,7 +71,7 @@ def read(folder: Path, *, only_last: bool = False) -> list[RunData]:
     for arm, about, run in entries:
         path = folder / CONFIGS
         try:
-            config = Config.from_json(json.dumps(about))
+            config = Config.from_values(about)
             ended = Ending(**run["ended"]) if run["ended"] else None
             place = folder / run["path"]
         except (KeyError, TypeError) as error:
@@ -109,12 +108,12 @@ def write(folder: Path, runs: Iterable[RunData]) -> None:
         ConfigError: a row has a key that packing needs.
         OSError: a file could not be written.
     """
-    runs = _sorted(runs)
+    runs = in_order(runs)
     lines = []
     for run in runs:
         if clash := next((key for row in run.rows for key in KEYS if key in row), None):
             raise ConfigError(f"{run.path}: its rows have a key {clash!r}, which packing needs")
-        key = dict(zip(KEYS, _key(run), strict=True))
+        key = dict(zip(KEYS, run.key, strict=True))
         lines += [json.dumps({**key, **row}, allow_nan=False) + "\n" for row in run.rows]
     groups: dict[tuple, list[RunData]] = {}
     for run in runs:
@@ -131,13 +130,13 @@ def added(here: Sequence[RunData], more: Iterable[RunData]) -> list[RunData]:
     Raises:
         ConfigError: one of the others has the game, arm and seed of a run that has other rows or settings.
     """
-    runs = {_key(run): run for run in here}
+    runs = {run.key: run for run in here}
     for run in more:
-        there = runs.setdefault(_key(run), run)
+        there = runs.setdefault(run.key, run)
         for what, same in (("rows", there.rows == run.rows), ("settings", there.config == run.config)):
             if not same:
                 raise ConfigError(
-                    f"{run.path}: {_name(*_key(run))} is there with other {what}, from {there.path}; "
+                    f"{run.path}: {_name(*run.key)} is there with other {what}, from {there.path}; "
                     "pack it into another folder"
                 )
     return list(runs.values())
@@ -189,7 +188,7 @@ def unpack(folder: Path, root: Path) -> int:
         raise ConfigError(f"{there}: a run is there; name another directory")
     for path, run in runs.items():
         path.mkdir(parents=True, exist_ok=True)
-        replace_text(path / "config.json", json.dumps(run.about, indent=2) + "\n")
+        config_file.write(path, run.about)
         replace_text(path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in run.rows))
         if run.ended is not None:
             ending.write(path, run.ended)
@@ -201,16 +200,8 @@ def _is_over(run: RunData) -> bool:
     return run.ended is not None or bool(run.rows) and run.rows[-1]["env_steps"] >= run.config.steps
 
 
-def _key(run: RunData) -> tuple[str, str, int]:
-    return run.game, run.arm, run.seed
-
-
 def _name(game: str, arm: str, seed: int) -> str:
     return f"{game}, {arm}, seed {seed}"
-
-
-def _sorted(runs: Iterable[RunData]) -> list[RunData]:
-    return sorted(runs, key=lambda run: (run.game, natural(run.arm), run.seed))
 
 
 def _arm(folder: Path, runs: Sequence[RunData]) -> dict[str, Any]:
@@ -240,12 +231,10 @@ def _place(name: str) -> tuple[int, str]:
 def _entries(folder: Path) -> list[tuple[str, dict[str, Any], Mapping[str, Any]]]:
     """(arm, the content of config.json, the run's entry) of each run in configs.json."""
     path = folder / CONFIGS
+    found = read_json(path, MOST_BYTES)
     try:
-        found = parse_json(read_bytes(path, MOST_BYTES))
         return [(arm["arm"], {**arm["config"], **run["config"]}, run) for arm in found for run in arm["runs"]]
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except (ValueError, TypeError, KeyError) as error:
+    except (TypeError, KeyError) as error:
         raise ConfigError(f"{path}: not what packing writes ({error})") from None
 
 

@@ -1,4 +1,4 @@
-"""The figures of a run, as small PNG files, and its GIFs.
+"""Pictures of curves: panels of lines with their bands, and the differences of arms from a baseline.
 
 matplotlib and Pillow are the extra `plots` and are imported where they are used; `available()` says
 whether they can be. Figures are built as objects, without pyplot: no global state and no display.
@@ -6,27 +6,248 @@ whether they can be. Figures are built as objects, without pyplot: no global sta
 
 import importlib.util
 import os
-from collections.abc import Iterable, Mapping, Sequence
+import textwrap
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from srl_jax import envs
+from srl_jax import envs, statistics
+from srl_jax.config import Config
+from srl_jax.data import reference_policies
+
+from . import collect
+from .colours import Style, styles
 
 STEPS_LABEL = "env steps"
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
-"""Okabe and Ito's palette: distinguishable to colour-blind readers."""
-MAX_EXAMPLES = 6
-CHANNELS = (1, 3)  # of an image that can be shown: grey, or red, green and blue
 NEAR = 0.02
 """Of an axis: reference policies that are as near to each other as that share a line."""
 
 
-def steps_label(game: str) -> str:
-    """Of an axis of env steps, which may have several frames of an emulator in one; "" is no game."""
-    frames = envs.known(game).frames_per_step if game else 1
-    return f"{STEPS_LABEL} ({frames} frames each)" if frames > 1 else STEPS_LABEL
+class Curve(NamedTuple):
+    """A number against env steps, or against another number: [N] each.
+
+    `low` and `high` are the limits of an interval, or of another band; NaN where there is none.
+    """
+
+    at: Sequence[float]
+    point: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+
+
+class Line(NamedTuple):
+    """A line of a panel.
+
+    Attributes:
+        label: in the legend; the same arm has the same one in all panels.
+        curve: may have no points.
+        seeds: whose mean it is; 0 is not told. The band of fewer than two is no interval: it is shown whole.
+        thesis: (env steps, returns) of the thesis' own curve, or None.
+    """
+
+    label: str
+    curve: Curve
+    seeds: int = 0
+    thesis: tuple | None = None
+
+
+class Level(NamedTuple):
+    """A published result, or what a reference policy scores: a horizontal line.
+
+    Attributes:
+        method: whose, at the line; of a policy "random" or "no-op".
+        score: where it is.
+        differs: what differs from the runs that are drawn, below the figure; may be empty.
+    """
+
+    method: str
+    score: float
+    differs: str = ""
+
+
+class Panel(NamedTuple):
+    """What one pair of axes shows.
+
+    Attributes:
+        game: what an env step is of; "" for none.
+        lines: see `Line`.
+        levels, policies: published results, dotted, and policies that learn nothing, dash-dotted.
+        title, across: above it and below; empty for the game and its env steps.
+        limits: of the vertical axis; None for what `heights` gives.
+        log: whether that is logarithmic, where all values are positive and span a factor of 5 or more.
+    """
+
+    game: str
+    lines: Sequence[Line]
+    levels: Sequence[Level] = ()
+    policies: Sequence[Level] = ()
+    title: str = ""
+    across: str = ""
+    limits: tuple[float, float] | None = None
+    log: bool = False
+
+
+def interval_curve(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
+    """The mean of several runs' curves and its interval, at steps that all have; None without such.
+
+    A run with one value is left out where others have more.
+
+    Args:
+        runs: env steps [N], ascending, and values [N] of each; N may differ.
+    """
+    kept = [run for run in runs if len(run[0]) > 1] or [run for run in runs if len(run[0])]
+    try:
+        steps, values = statistics.at_equal_steps(kept)
+    except ValueError:
+        return None
+    return Curve(steps, *statistics.curve_interval(values)[:3])
+
+
+def draw_panels(
+    panels: Sequence[Panel],
+    path: str | os.PathLike,
+    title: str,
+    note: str = "",
+    looks: Mapping[str, Style] | None = None,
+    label: str = "mean return",
+    size: tuple[float, float] | None = None,
+) -> Path:
+    """Draws panels, up to three in a row, with a legend and notes below.
+
+    The thesis' curves are dashed, in their arm's colour, and end where the panel's longest line does.
+
+    Args:
+        panels: at least one, with at least one line.
+        path: of the PNG file.
+        title: of the figure, or empty.
+        note: below it; lines.
+        looks: label -> colour and line; None for those that the labels have by themselves.
+        label: of the vertical axes.
+        size: width and height in inches of a single panel, which is drawn alone: which line is whose is said
+            beside it.
+    """
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    labels = dict.fromkeys(line.label for panel in panels for line in panel.lines)
+    looks = looks or styles(list(labels))
+    width = 4.6 if columns > 1 else 6.4
+    figure = new_figure(*(size or (width * columns, 3.5 * rows + 0.24 * len(labels) + 0.7)))
+    handles: dict[str, Any] = {}
+    for i, panel in enumerate(panels):
+        axes = figure.add_subplot(rows, columns, i + 1, ylabel=label)
+        handles |= _draw_panel(axes, panel, looks)
+    if not size:
+        _below(figure, int(17 * width * columns), handles, panels, note)
+    if title:
+        figure.suptitle(title, fontsize=11).set_parse_math(False)
+    return save(figure, path)
+
+
+def _draw_panel(axes, panel: Panel, looks: Mapping[str, Style]) -> dict[str, Any]:
+    """Draws one panel; returns {text of the legend: its line}."""
+    axes.set_title(textwrap.fill(panel.title or panel.game, 36), fontsize=10, parse_math=False)
+    axes.set_xlabel(across := panel.across or steps_label(panel.game))
+    lines = [line for line in panel.lines if len(line.curve.at)]
+    end = max((max(line.curve.at) for line in lines), default=1) or 1
+    handles = {}
+    for label, curve, seeds, thesis in lines:
+        colour, pattern = looks[label]
+        axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0)
+        marker = "o" if len(curve.at) == 1 else ""
+        (drawn,) = axes.plot(curve.at, curve.point, pattern, color=colour, linewidth=1.8, marker=marker)
+        handles[f"{label} ({seeds} seed{'' if seeds == 1 else 's'})" if seeds else label] = drawn
+        if thesis is not None:
+            steps, returns = (np.asarray(x, float) for x in thesis)
+            at = np.unique(np.minimum(steps, end))
+            returns = np.interp(at, steps, returns)
+            axes.plot(at, returns, "--", color=colour, linewidth=1.2, alpha=0.8)
+    if across.startswith(STEPS_LABEL):
+        count_axis(axes)
+        axes.set_xlim(0, end)
+    else:
+        plain(axes)
+    shown = [line.get_ydata() for line in axes.lines]
+    shown += [x for line in lines if line.seeds < 2 for x in (line.curve.low, line.curve.high)]
+    shown = np.concatenate([*shown, [x.score for x in (*panel.levels, *panel.policies)]])
+    if panel.log and len(shown) and 0 < 5 * np.nanmin(shown) <= np.nanmax(shown):
+        axes.set_yscale("log")
+    elif np.isfinite(shown).any():
+        axes.set_ylim(*(panel.limits or heights([line.curve for line in lines], shown)))
+    levels(axes, {x.method: x.score for x in panel.policies}, panel.levels)
+    return handles
+
+
+def _below(figure, width: int, handles: dict[str, Any], panels: Sequence[Panel], note: str) -> None:
+    """The legend and the notes, which are `width` characters wide."""
+    from matplotlib.lines import Line2D
+
+    notes = note.splitlines()
+    for panel in panels:
+        told = [x._replace(method=f"{x.method} policy") for x in panel.policies] + list(panel.levels)
+        notes += [f"{panel.game}, {x.method}, {x.score:g}: {x.differs}" for x in told if x.differs]
+    notes = [line for text in notes for line in textwrap.wrap(text, width, subsequent_indent="    ")]
+    if any(line.thesis is not None for panel in panels for line in panel.lines):  # in no arm's colour
+        grey = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
+        handles = {**handles, "the thesis' own, one run each": grey}
+    legend = figure.legend(
+        handles.values(),
+        handles.keys(),
+        loc="outside lower center",
+        ncols=1 if len(panels) == 1 else 2,
+        fontsize=8,
+        title="\n".join(notes),
+        title_fontsize=7,
+        alignment="left",
+        frameon=False,
+    )
+    for text in (legend.get_title(), *legend.get_texts()):
+        text.set_parse_math(False)
+
+
+def policy_levels(config: Config) -> list[Level]:
+    """What policies that learn nothing score on a run's game."""
+    found = reference_policies(config.game).items()
+    return [Level(name, row.return_mean, collect.differs(row, config)) for name, row in found]
+
+
+def differences(
+    title: str,
+    baseline: str,
+    panels: Mapping[str, Mapping[str, statistics.Interval]],
+    looks: Sequence[Style],
+    path: str | os.PathLike,
+) -> Path:
+    """Draws how arms differ from the baseline: a point and an interval each, beside 0.
+
+    Args:
+        title: above it.
+        baseline: its name.
+        panels: what differs -> arm -> the difference; the same arms in each.
+        looks: of the arms.
+        path: of the PNG file.
+    """
+    arms = list(next(iter(panels.values())))
+    figure = new_figure(5.4, 1.1 + 0.3 * len(arms))
+    figure.suptitle(title, fontsize=11).set_parse_math(False)
+    grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for axes, (name, found) in zip(grid, panels.items(), strict=True):
+        plain(axes)
+        axes.grid(False, axis="y")
+        axes.axvline(0, color="#555555", linewidth=1)
+        for i, (interval, (colour, _)) in enumerate(zip(found.values(), looks, strict=True)):
+            axes.plot([interval.low, interval.high], [i, i], color=colour, linewidth=2.2)
+            axes.plot([interval.point], [i], "o", color=colour, markersize=5)
+        axes.set_yticks(range(len(arms)), arms, fontsize=8, parse_math=False)
+        axes.set_ylim(len(arms) - 0.4, -0.6)
+        axes.set_title(name, fontsize=8.5, parse_math=False)
+        axes.spines["left"].set_visible(False)
+        axes.tick_params(axis="y", length=0)
+        axes.tick_params(axis="x", labelsize=8)
+        axes.margins(x=0.08)
+    figure.supxlabel(f"difference from {baseline}", fontsize=8).set_parse_math(False)
+    return save(figure, path)
 
 
 def available() -> bool:
@@ -34,215 +255,10 @@ def available() -> bool:
     return all(importlib.util.find_spec(name) for name in ("matplotlib", "PIL"))
 
 
-def learning_curve(
-    rows: Iterable[Mapping[str, Any]],
-    path: str | os.PathLike,
-    title: str,
-    reference: Sequence[tuple[str, Sequence[float], Sequence[float]]] | None = None,
-    policies: Mapping[str, float] | None = None,
-    game: str = "",
-) -> Path | None:
-    """Draws the mean evaluation return, and the worst to the best game, against env steps.
-
-    Args:
-        rows: of metrics.jsonl; those of kind "eval" with `eval/return_mean` count.
-        path: of the PNG file.
-        title: of the figure.
-        reference: other curves, (label, env steps, mean returns) each, drawn dashed and only as far
-            as the run goes: curves are compared at equal steps.
-        policies: see `levels`.
-        game: the run's, for what an env step is.
-
-    Returns:
-        The path, or None if there is no evaluation to draw (then nothing is written).
-    """
-    evals = [row for row in rows if row["kind"] == "eval" and "eval/return_mean" in row]
-    if not evals:
-        return None
-    steps = np.array([row["env_steps"] for row in evals], float)
-    means = np.array([row["eval/return_mean"] for row in evals], float)
-    games = [np.array(row.get("eval/returns") or [np.nan], float) for row in evals]
-    counts = sorted({len(game) for game in games if np.isfinite(game).all()})
-
-    figure = new_figure(6.4, 4.0)
-    axes = figure.add_subplot(xlabel=steps_label(game))
-    axes.set_title(title, parse_math=False)
-    over = f" over {' or '.join(map(str, counts))} games" if counts else ""
-    axes.set_ylabel("mean return" + over)
-    line = {"marker": "o", "markersize": 3.5} if len(evals) <= 60 else {}
-    if counts:
-        axes.fill_between(
-            steps,
-            [game.min() for game in games],
-            [game.max() for game in games],
-            color=COLOURS[0],
-            alpha=0.15,
-            linewidth=0,
-            label="worst to best game",
-        )
-    axes.plot(steps, means, color=COLOURS[0], linewidth=1.8, label="this run", **line)
-    end = steps.max()
-    for i, (label, theirs, returns) in enumerate(reference or ()):
-        theirs, returns = np.asarray(theirs, float), np.asarray(returns, float)
-        # The run's last step may cut the curve between two of its points.
-        at = np.unique(np.minimum(theirs, end))
-        colour = COLOURS[1 + i % (len(COLOURS) - 1)]
-        axes.plot(at, np.interp(at, theirs, returns), "--", color=colour, linewidth=1.4, label=label)
-    count_axis(axes)
-    if end == 0:  # evaluated before training only: keep the axis from counting in thousandths
-        axes.set_xlim(-1, 1)
-    levels(axes, policies or {})
-    axes.legend(loc="best", fontsize=8, framealpha=0.8)
-    return save(figure, path)
-
-
-def losses(rows: Iterable[Mapping[str, Any]], path: str | os.PathLike, game: str = "") -> Path | None:
-    """Draws every `loss/NAME` of the train rows in a panel of its own, and the gradient norm.
-
-    The vertical axis is logarithmic where all values are positive and span a factor of 5 or more.
-    Where there are many rows, a running mean lies over the pale single values.
-
-    Returns:
-        The path, or None if there is nothing to draw (then nothing is written).
-    """
-    train = [row for row in rows if row["kind"] == "train"]
-    keys = sorted({key for row in train for key in row if key.startswith("loss/")})
-    keys += sorted({key for row in train for key in row if key.split("/")[0] == "grad_norm"})
-    curves = []
-    for key in keys:
-        at = np.array([row["env_steps"] for row in train if row.get(key) is not None], float)
-        values = np.array([row[key] for row in train if row.get(key) is not None], float)
-        if len(at):
-            curves.append((key, at, values))
-    if not curves:
-        return None
-    columns = min(len(curves), 3 if len(curves) != 4 else 2)
-    lines = -(-len(curves) // columns)
-    figure = new_figure(3.2 * columns + 0.4, 2.3 * lines + 0.3)
-    for i, (key, at, values) in enumerate(curves):
-        axes = figure.add_subplot(lines, columns, i + 1)
-        span = len(at) // 25
-        axes.plot(
-            at,
-            values,
-            color=COLOURS[0],
-            linewidth=0.8 if span > 1 else 1.2,
-            alpha=0.35 if span > 1 else 1.0,
-            marker="." if len(at) < 10 else "",
-        )
-        if span > 1:
-            kernel = np.full(span, 1 / span)
-            smooth = [np.convolve(curve, kernel, mode="valid") for curve in (at, values)]
-            axes.plot(*smooth, color=COLOURS[0], linewidth=1.4)
-        name = key.replace("grad_norm", "gradient norm").replace("norm/", "norm, ")
-        axes.set_title(name, fontsize=9, parse_math=False)
-        if values.min() > 0 and values.max() >= 5 * values.min():
-            log_axis(axes, values.max() / values.min())
-        count_axis(axes)
-        axes.tick_params(labelsize=7)
-        if i + columns >= len(curves):
-            axes.set_xlabel(steps_label(game), fontsize=8)
-    return save(figure, path)
-
-
-def image_panel(
-    inputs: np.ndarray,
-    targets: np.ndarray,
-    outputs: np.ndarray,
-    path: str | os.PathLike,
-    title: str,
-) -> Path:
-    """Draws examples in rows: input, target, output, and how far the output is from the target.
-
-    Three channels are shown in colour; the difference is then the largest of the three.
-
-    Args:
-        inputs: float [B, H, W, C] in [0, 1], C of 1 or 3; the newest frame that the encoder saw. The first 6
-            examples are drawn.
-        targets: likewise; what the output should be.
-        outputs: likewise; may leave [0, 1], which is shown clipped; the difference is not clipped.
-        path: of the PNG file.
-        title: of the figure.
-
-    Returns:
-        The path.
-
-    Raises:
-        ValueError: if the shapes differ or the images are not float.
-    """
-    given = [np.asarray(images) for images in (inputs, targets, outputs)]
-    alike = len({images.shape for images in given}) == 1
-    if not alike or given[0].ndim != 4 or given[0].shape[3] not in CHANNELS or not given[0].size:
-        shapes = ", ".join(str(images.shape) for images in given)
-        raise ValueError(f"images must be [B, H, W, 1] or [B, H, W, 3], all of one shape; got {shapes}")
-    if not all(np.issubdtype(images.dtype, np.floating) for images in given):
-        raise ValueError("images must be float in [0, 1]")
-    shown = [images[:MAX_EXAMPLES].astype(np.float32) for images in given]
-    difference = np.abs(shown[2] - shown[1]).max(-1, keepdims=True)
-    top = float(difference.max()) or 1.0
-
-    count = len(difference)
-    figure = new_figure(1.15 * 4 + 0.9, 1.15 * count + 0.75)
-    axes = figure.subplots(count, 4, squeeze=False)
-    names = ("input", "target", "output", "|output - target|")
-    for column, (name, images) in enumerate(zip(names, [*shown, difference], strict=True)):
-        last = column == 3
-        for i, image in enumerate(images):
-            drawn = axes[i, column].imshow(
-                image[..., 0] if image.shape[-1] == 1 else image.clip(0, 1),
-                cmap="inferno" if last else "gray",
-                vmin=0,
-                vmax=top if last else 1,
-            )
-            axes[i, column].set_axis_off()
-        axes[0, column].set_title(name, fontsize=9)
-    bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02, aspect=12 * count)
-    bar.set_label("absolute difference", fontsize=8)
-    bar.ax.tick_params(labelsize=7)
-    figure.suptitle(title, fontsize=10).set_parse_math(False)
-    return save(figure, path)
-
-
-def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int = 3) -> Path:
-    """Writes frames as a GIF that repeats for ever.
-
-    Args:
-        frames: uint8 [T, H, W, C], C of 1 (grey) or 3 (RGB), T at least 1.
-        path: of the file.
-        fps: frames a second; a GIF counts in hundredths of a second, and is rounded to them.
-        scale: every pixel becomes a square of this many pixels a side.
-
-    Returns:
-        The path.
-
-    Raises:
-        ValueError: for another shape or dtype.
-    """
-    from PIL import Image
-
-    frames = np.asarray(frames)
-    if frames.dtype != np.uint8 or frames.ndim != 4 or frames.shape[3] not in CHANNELS:
-        got = f"{frames.dtype} {frames.shape}"
-        raise ValueError(f"frames must be uint8 [T, H, W, 1] or [T, H, W, 3]; got {got}")
-    if not len(frames):
-        raise ValueError("a GIF needs at least one frame")
-    images = [
-        Image.fromarray(frame[..., 0] if frame.shape[-1] == 1 else frame).resize(
-            (frame.shape[1] * scale, frame.shape[0] * scale), Image.Resampling.NEAREST
-        )
-        for frame in frames
-    ]
-    path = _folder(path)
-    hundredths = max(round(100 / fps), 2)  # browsers slow down a GIF with shorter frames
-    images[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=hundredths * 10,
-        loop=0,
-    )
-    return path
+def steps_label(game: str) -> str:
+    """Of an axis of env steps, which may have several frames of an emulator in one; "" is no game."""
+    frames = envs.known(game).frames_per_step if game else 1
+    return f"{STEPS_LABEL} ({frames} frames each)" if frames > 1 else STEPS_LABEL
 
 
 def new_figure(width: float, height: float):
@@ -255,17 +271,18 @@ def new_figure(width: float, height: float):
     return figure
 
 
-def heights(lines: Any, bands: Any = ()) -> tuple[float, float]:
+def heights(curves: Collection[Curve], levels: Collection[float] = ()) -> tuple[float, float]:
     """Limits of a vertical axis that show all of the lines, and of bands what does not make the lines flat.
 
     The t interval of two runs is nine standard deviations wide to either side; what is further from the lines
     than they are high, all together, is cut off.
 
     Args:
-        lines: values [N], some of them finite.
-        bands: limits of intervals [M]; those that are not finite do not count.
+        curves: lines and their bands.
+        levels: what else has to be shown; those that are not finite do not count, but one is, or a line.
     """
-    lines, bands = (np.asarray(values, float) for values in (lines, bands))
+    lines = np.concatenate([*(curve.point for curve in curves), [*levels]]).astype(float)
+    bands = np.concatenate([[], *(limit for curve in curves for limit in curve[2:])]).astype(float)
     low, high = np.nanmin(lines), np.nanmax(lines)
     room = high - low or 0.5
     shown = np.clip(np.append(bands[np.isfinite(bands)], [low, high]), low - room, high + room)
@@ -288,18 +305,18 @@ def plain(axes) -> None:
     axes.spines[["top", "right"]].set_visible(False)
 
 
-def levels(axes, policies: Mapping[str, float], others: Sequence[tuple[str, float]] = ()) -> None:
+def levels(axes, policies: Mapping[str, float], others: Sequence[Level] = ()) -> None:
     """Draws horizontal lines, their names side by side along them, so that near ones can be told apart.
 
     Args:
         axes: with everything else in it.
         policies: name -> mean return of policies that learn nothing, dash-dotted.
-        others: (name, height), dotted.
+        others: dotted.
     """
     from matplotlib.patheffects import Normal, Stroke
 
-    lines = [(name, height, {"linestyle": ":", "linewidth": 1}) for name, height in others]
-    heights = [*axes.get_ylim(), *policies.values(), *(height for _, height in others)]
+    lines = [(x.method, x.score, {"linestyle": ":", "linewidth": 1}) for x in others]
+    heights = [*axes.get_ylim(), *policies.values(), *(x.score for x in others)]
     thin = {"linestyle": "-.", "linewidth": 0.8}
     if len(policies) > 1 and np.ptp(list(policies.values())) <= NEAR * np.ptp(heights):
         lines.append((", ".join(policies), float(np.mean(list(policies.values()))), thin))
@@ -322,28 +339,12 @@ def levels(axes, policies: Mapping[str, float], others: Sequence[tuple[str, floa
         text.set_in_layout(False)
 
 
-def log_axis(axes, span: float) -> None:
-    """A logarithmic axis of values; the largest is `span` times the smallest."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
-    axes.set_yscale("log")
-    if span < 100:  # too narrow for powers of ten alone to say much
-        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        axes.yaxis.set_minor_formatter(NullFormatter())
-
-
-def _folder(path: str | os.PathLike) -> Path:
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    return path
-
-
 def save(figure, path: str | os.PathLike) -> Path:
     """Writes a figure as a small PNG file, making its directory where there is none; returns the path."""
     from PIL import Image
 
-    path = _folder(path)
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
     # A palette makes the file a third as large, and nobody sees the difference.
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")

@@ -27,8 +27,8 @@ from absl import flags
 from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
+from srl_jax.display import Progress, hms
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.progress import Progress, hms
 from srl_jax.specs import Info, choices_text, value_text
 
 from . import flags as config_flags

@@ -1,49 +1,49 @@
 """One self-contained page about many runs: `python -m experiments.report runs/ --out=report.html`.
 
-What was run, figures, statistics with intervals, learning curves, what the agents do and see, diagnostics,
-cost, and every difference between the arms. It opens offline. Several directories are compared with each
+The question and the answer, from the directory's README.md; what the numbers say, with intervals; curves of
+every seed, training, diagnostics, what the agents do and see, cost, and every difference between the arms. It
+opens offline. All rows lie beside it as a table, report.csv. Several directories are compared with each
 other: `python -m experiments.report runs/a runs/b --out=report.html`.
 """
 
+import functools
+import importlib.util
+import math
 import os
 from pathlib import Path
 
 from absl import flags
 
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.reading import replace_text
 
 from . import flags as config_flags
-from . import plots
 
 FLAGS = flags.FLAGS
+NEEDED = {"jinja2": "Jinja2", "markdown_it": "markdown-it-py", "matplotlib": "matplotlib", "PIL": "Pillow"}
+"""Modules of the extra `plots`, by which a page is made, and their packages."""
 
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_multi_string(
-        "runs",
-        None,
-        "directory in or below which the runs are, or several; the name may be left out",
-        flag_values=values,
-    )
-    flags.DEFINE_string("out", None, "file to write, must end in .html", flag_values=values)
-    flags.DEFINE_boolean("overwrite", False, "replace the file if there is one", flag_values=values)
-    flags.DEFINE_string(
-        "baseline", None, "arm that the others are compared with; by default RL alone", flag_values=values
-    )
-    flags.DEFINE_multi_string(
+    kinds = (flags.DEFINE_string, flags.DEFINE_boolean, flags.DEFINE_multi_string)
+    text, yes, texts = (functools.partial(kind, flag_values=values) for kind in kinds)
+    texts("runs", None, "directory in or below which the runs are, or several; the name may be left out")
+    text("out", None, "file to write, must end in .html; beside it goes a .csv")
+    yes("overwrite", False, "replace the files if they are there")
+    text("baseline", None, "arm that the others are compared with; by default RL alone")
+    texts(
         "reach",
         [],
         "GAME=SCORE, the score whose env steps are asked for; by default what the baseline ends with",
-        flag_values=values,
     )
-    flags.DEFINE_boolean("force", False, "compare runs with different protocols", flag_values=values)
-    flags.DEFINE_boolean("finished_only", False, "compare only runs that have ended", flag_values=values)
-    flags.DEFINE_boolean("media", True, "show the runs' own pictures", flag_values=values)
+    yes("force", False, "compare runs with different protocols")
+    yes("finished_only", False, "compare only runs that have ended")
+    yes("media", True, "show the runs' own pictures")
 
 
 def check_out(out: str | None, *, overwrite: bool) -> Path:
-    """Whether the page can be written there; writes nothing.
+    """Whether the page, and the table beside it, can be written there; writes nothing.
 
     Raises:
         ConfigError: it cannot, or there is a file that must not be overwritten.
@@ -56,10 +56,11 @@ def check_out(out: str | None, *, overwrite: bool) -> Path:
     path = Path(os.path.expanduser(out))
     config_flags.check_place("out", str(path.parent))
     try:
-        if path.is_dir():
-            raise ConfigError(f"--out={out}: is a directory")
-        if os.path.lexists(path) and not overwrite:
-            raise ConfigError(f"--out={out}: exists; name a new file, or --overwrite replaces it")
+        for file in (path, path.with_suffix(".csv")):
+            if file.is_dir():
+                raise ConfigError(f"--out={out}: {file} is a directory")
+            if os.path.lexists(file) and not overwrite:
+                raise ConfigError(f"--out={out}: {file} exists; name a new file, or --overwrite replaces it")
     except OSError as error:
         raise ConfigError(f"--out={out}: {error.strerror}") from None
     return path
@@ -73,44 +74,28 @@ def check_reach(texts: list[str]) -> dict[str, float]:
     """
     found = {}
     for given in texts:
-        game, _, score = given.partition("=")
+        game, _, score = given.rpartition("=")
         try:
             found[game] = float(score)
         except ValueError:
-            raise ConfigError(f"--reach={given}: must be GAME=SCORE, --reach=Pong=0") from None
-        if not game or not abs(found[game]) < float("inf"):
+            found[game] = math.nan
+        if not game or not math.isfinite(found[game]):
             raise ConfigError(f"--reach={given}: must be GAME=SCORE, --reach=Pong=0")
     return found
 
 
-def write(path: Path, text: str) -> None:
-    """Writes the page as a whole or not at all.
-
-    Raises:
-        SaveError: it cannot be written.
-    """
-    partial = path.with_name(path.name + ".partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_text(text, encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise SaveError(f"--out={path}: {error.strerror}") from None
-
-
 def report(values: flags.FlagValues) -> Path:
-    """Checks the command line, reads the runs and writes the page.
+    """Checks the command line, reads the runs and writes the page, and the table beside it.
 
     Args:
         values: parsed flags, as `define_flags` defines them.
 
     Returns:
-        The file that was written.
+        The page's file.
 
     Raises:
         ConfigError: the command line or what the runs hold is not valid; nothing was written.
-        SaveError: the page cannot be written.
+        SaveError: a file cannot be written.
     """
     runs = values["runs"].value
     if not runs:
@@ -120,12 +105,19 @@ def report(values: flags.FlagValues) -> Path:
     for root in runs:
         if not Path(root).is_dir():
             raise ConfigError(f"--runs={root}: no such directory")
-    if not plots.available():
-        raise ConfigError("the pictures of a report need matplotlib and Pillow: pip install 'srl-jax[plots]'")
+    if missing := [name for module, name in NEEDED.items() if not importlib.util.find_spec(module)]:
+        raise ConfigError(f"a report needs {', '.join(missing)}: pip install 'srl-jax[plots]'")
     from .reporting import page
 
+    table = path.with_suffix(".csv")
     same = {name: values[name].value for name in ("baseline", "force", "finished_only", "media")}
-    write(path, page.build(*runs, reach=reach, **same))
+    html, rows = page.build(*runs, reach=reach, data=table.name, **same)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for file, text in ((table, rows), (path, html)):
+            replace_text(file, text)
+    except OSError as error:
+        raise SaveError(f"--out={path}: {error.strerror}") from None
     return path
 
 
@@ -133,7 +125,8 @@ def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
     path = report(FLAGS)
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
+    for file in (path, path.with_suffix(".csv")):
+        print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
 
 
 def cli() -> None:

@@ -13,7 +13,7 @@ from srl_jax.errors import ConfigError
 
 from . import flags as config_flags
 from . import help, train
-from .directories import natural
+from .run_data import natural
 from .sweeping.manifest import FILE
 
 

@@ -2,18 +2,18 @@
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from srl_jax import ending
+from srl_jax import config, ending
 from srl_jax.config import Config
+from srl_jax.diagnostics.drift import STEPS, drift_matrix, drift_names
 from srl_jax.ending import Ending
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
-
-from .directories import runs_below
-from .draw import read_rows
+from srl_jax.errors import ConfigError
+from srl_jax.metrics import KINDS, read_metrics
+from srl_jax.specs import LIMITS
 
 
 class RunData(NamedTuple):
@@ -38,9 +38,19 @@ class RunData(NamedTuple):
     about: Mapping[str, Any] = MappingProxyType({})
 
     @property
+    def key(self) -> tuple[str, str, int]:
+        """What it is a run of: (game, arm, seed)."""
+        return self.game, self.arm, self.seed
+
+    @property
     def failed(self) -> bool:
         """Whether it ended with an error, and is not under way."""
         return self.ended is not None and self.ended.failed
+
+
+def in_order(runs: Iterable[RunData]) -> list[RunData]:
+    """Runs by game, arm and seed."""
+    return sorted(runs, key=lambda run: (run.game, natural(run.arm), run.seed))
 
 
 def arm_name(path: Path) -> str:
@@ -57,11 +67,59 @@ def load_run(path: Path) -> RunData:
     Raises:
         ConfigError: it is none, or what it holds is not what training writes.
     """
-    config = Config.load(path)
+    its, about = config.read(path)
     metrics = path / "metrics.jsonl"
     rows = read_rows(metrics) if metrics.exists() else []
-    about = parse_json(read_bytes(path / "config.json", SETTINGS))
-    return RunData(path, config.game, arm_name(path), config.seed, config, rows, ending.read(path), about)
+    return RunData(path, its.game, arm_name(path), its.seed, its, rows, ending.read(path), about)
+
+
+def runs_below(root: Path, file: str = "config.json") -> list[Path]:
+    """Directories with a config.json, or another file, in or below a directory.
+
+    Links are followed: a run may lie elsewhere.
+
+    Each is found once: by its own path where that is below, else by the first link to it. A link to what the
+    link or the root lies in is not followed.
+
+    Returns:
+        As `natural` sorts them.
+
+    Raises:
+        ConfigError: a directory cannot be read.
+    """
+
+    def refuse(error: OSError) -> None:
+        if not isinstance(error, FileNotFoundError):  # removed meanwhile, by a run that is under way
+            raise ConfigError(f"{error.filename}: {error.strerror}")
+
+    found: list[str] = []
+    seen: set[str] = set()
+    waiting = [os.fspath(root)]
+    while waiting:
+        links: list[str] = []
+        for top in waiting:
+            for folder, folders, files in os.walk(top, onerror=refuse):
+                real = os.path.realpath(folder)
+                if real in seen:
+                    folders.clear()
+                    continue
+                seen.add(real)
+                if file in files and os.path.isfile(os.path.join(folder, file)):
+                    found.append(folder)
+                paths = [os.path.join(folder, name) for name in folders]
+                links += [path for path in paths if os.path.islink(path) and not _around(path, real, root)]
+        waiting = sorted(links, key=natural)
+    return [Path(folder) for folder in sorted(found, key=natural)]
+
+
+def _around(link: str, *places: str | Path) -> bool:
+    """Whether a link leads to a directory in which one of the places lies."""
+    return any(Path(os.path.realpath(place)).is_relative_to(os.path.realpath(link)) for place in places)
+
+
+def natural(text: str) -> list:
+    """A key for sorting names with numbers in them by these: seed2 before seed10."""
+    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", text))]
 
 
 def run_directories(root: Path) -> list[Path]:
@@ -72,3 +130,61 @@ def run_directories(root: Path) -> list[Path]:
     """
     below = runs_below(root)
     return [path for path in below if not any(".broken-" in part for part in path.relative_to(root).parts)]
+
+
+def read_rows(path: Path) -> list[dict]:
+    """`srl_jax.metrics.read_metrics`, with what is drawn of each row checked.
+
+    Raises:
+        ConfigError: it cannot be read, or holds something else than training writes; one line.
+    """
+    try:
+        rows = read_metrics(path)
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    check_rows(rows, str(path))
+    return rows
+
+
+def check_rows(rows: list[dict], name: str) -> None:
+    """Whether what is drawn of rows is what training writes.
+
+    Args:
+        rows: as `read_metrics` gives them.
+        name: what they are the rows of, for errors.
+
+    Raises:
+        ConfigError: it is something else; one line.
+    """
+    for number, row in enumerate(rows, 1):
+        if row.get("kind") not in KINDS:
+            raise ConfigError(f"{name}, line {number}: kind is none of {', '.join(KINDS)}")
+        if not _is_count(row.get("env_steps")):
+            raise ConfigError(f"{name}, line {number}: env_steps is no count")
+        for key, value in row.items():
+            kind = key.partition("/")[0]
+            if key in ("eval/returns", STEPS):
+                good = isinstance(value, list) and all(map(_is_count if key == STEPS else _is_number, value))
+            elif kind == "diag" and isinstance(value, list):
+                good = all(map(_is_number, value))
+            else:
+                drawn = kind in ("loss", "grad_norm", "diag") or key == "eval/return_mean"
+                good = not drawn or _is_number(value)
+            if not good:
+                raise ConfigError(f"{name}, line {number}: {key} is not made of numbers of single precision")
+    for kind in drift_names(rows):
+        try:
+            drift_matrix(rows, kind)
+        except ValueError as error:
+            raise ConfigError(f"{name}: {error}") from None
+
+
+def _is_count(value: Any) -> bool:
+    return type(value) is int and 0 <= value <= LIMITS[int]
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a value is a number that single precision holds, or null."""
+    return value is None or (type(value) in (int, float) and abs(value) <= LIMITS[float])

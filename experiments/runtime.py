@@ -10,16 +10,13 @@ glibc and OpenBLAS read theirs when the process starts, so for those alone it re
 import hashlib
 import importlib.metadata
 import importlib.util
-import json
 import math
 import os
 import platform
 import re
 import stat
-import subprocess
 import sys
-import tempfile
-from collections.abc import Callable, Mapping, MutableMapping
+from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
 from srl_jax import display
@@ -52,10 +49,10 @@ MULTIPLY_ADDS = {"tiny": 2.1, "nature": 7.8, "sac_ae": 51.6, "impala": 54.7}
 counts them (`tests/runtime_test.py`). An encoder's size decides what helps it on a CPU, and has to be known
 before jax is imported. An encoder that is not listed, a user's own, counts as the largest."""
 
-XLA_FLAGS = (
-    "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT,LIBRARY_FUSION_TYPE_REDUCE",
-)
-"""Products and reductions by the YNNPACK library."""
+_YNN = "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT,LIBRARY_FUSION_TYPE_REDUCE"
+XLA_FLAGS = {"0.10": (_YNN,), "0.11": (_YNN,), "0.12": (_YNN,)}
+"""{jaxlib's version, without what follows the second number: flags}: products and reductions by the YNNPACK
+library. XLA ends a process whose flags it does not know, so a version that is not listed gets none."""
 FLAGS_FROM = 4.0
 """Million multiply-adds from which `XLA_FLAGS` pay. Updates of `nature` take 0.81 of the time with them. The
 products of `tiny` are too small: on Catch a run makes 370 env steps a second with them, and 440 without."""
@@ -63,32 +60,6 @@ THREAD_FROM = 20.0
 """Million multiply-adds from which a thread more than there are cores pays. With it, on two cores, updates
 of `sac_ae` take 0.86 of the time in joint training and 0.95 in RL alone, those of `nature` 1.02. `impala` has
 not been measured, with either."""
-
-_PROBE = """
-import numpy as np
-import jax
-import jax.numpy as jnp
-
-rng = np.random.default_rng(0)
-x = rng.standard_normal((4, 9, 9, 3)).astype("f")
-w = rng.standard_normal((3, 3, 3, 5)).astype("f")
-y = rng.standard_normal((4, 4, 4, 5)).astype("f")
-a, b = rng.standard_normal((2, 48, 48)).astype("f")
-
-def loss(w):
-    out = jax.lax.conv_general_dilated(x, w, (2, 2), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC"))
-    return jnp.sum(out * y), out
-
-(total, out), grad = jax.jit(jax.value_and_grad(loss, has_aux=True))(w)
-patches = np.stack([x[:, i : i + 7 : 2, j : j + 7 : 2] for i in range(3) for j in range(3)], 3)
-patches = patches.reshape(4, 4, 4, 3, 3, 3)
-want = np.einsum("nhwijc,ijco->nhwo", patches, w)
-close = dict(rtol=1e-4, atol=1e-4)
-np.testing.assert_allclose(out, want, **close)
-np.testing.assert_allclose(total, np.sum(want * y), **close)
-np.testing.assert_allclose(grad, np.einsum("nhwijc,nhwo->ijco", patches, y), **close)
-np.testing.assert_allclose(jax.jit(jnp.matmul)(a, b), a @ b, **close)
-"""
 
 
 def cache_folder(env: Mapping[str, str]) -> Path | None:
@@ -155,7 +126,7 @@ def wanted(
     gpu: bool,
     cache: Path | None,
     cores: int,
-    works: Callable[[str], bool],
+    jaxlib: str,
 ) -> dict[str, str]:
     """The variables to set, with their values; none that the user has set, but for XLA_FLAGS, which grows.
 
@@ -166,7 +137,7 @@ def wanted(
         gpu: whether jax will run on a GPU; what is for a CPU is then left out.
         cache: where jax may keep what it compiled, None for nowhere.
         cores: that the process may use.
-        works: whether XLA takes these XLA_FLAGS; asked only if there are new ones.
+        jaxlib: its version.
     """
     found = {}
     if glibc and not gpu and "glibc.malloc" not in env.get("GLIBC_TUNABLES", ""):
@@ -182,65 +153,9 @@ def wanted(
         found["NPROC"] = str(cores + 1)
     found = {name: value for name, value in found.items() if name not in env}
     present = env.get("XLA_FLAGS", "")
-    new = with_flags(present, XLA_FLAGS if work >= FLAGS_FROM else ())
-    if new.split() != present.split() and works(new):
-        found["XLA_FLAGS"] = new
-    return found
-
-
-def probe(xla_flags: str) -> bool | None:
-    """Whether XLA takes these flags and computes correctly with them; None where there is no telling.
-
-    XLA ends a process whose flags it does not know, so another one tries.
-    """
-    env = {name: value for name, value in os.environ.items() if name != "JAX_COMPILATION_CACHE_DIR"}
-    env |= {"XLA_FLAGS": xla_flags, "JAX_PLATFORMS": "cpu"}
-    try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE],
-            env=env,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            timeout=60,
-        )
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.returncode == 0
-
-
-def remembered(xla_flags: str, folder: Path | None) -> bool:
-    """`probe`, whose answers are kept in `folder/runtime.json` for the same versions and processor."""
-    versions = [f"{name} {importlib.metadata.version(name)}" for name in ("jax", "jaxlib", "numpy")]
-    key = json.dumps([*versions, f"python {platform.python_version()}", machine(), xla_flags])
-    answers = {}
-    if folder is not None:
-        try:
-            read = json.loads((folder / "runtime.json").read_text(encoding="utf-8"))
-            answers = {k: v for k, v in read.items() if isinstance(v, bool)}
-        except (OSError, ValueError, AttributeError, RecursionError):
-            pass  # None yet, or damaged: asked again.
-    if key in answers:
-        return answers[key]
-    _say("trying an XLA flag for this encoder, which takes some seconds; once for this machine")
-    answer = probe(xla_flags)
-    if folder is not None and answer is not None:
-        _write(folder / "runtime.json", json.dumps(answers | {key: answer}, indent=1))
-    return bool(answer)
-
-
-def _write(path: Path, text: str) -> None:
-    """Writes a file at once or, where that cannot be done, not at all."""
-    try:
-        handle, temporary = tempfile.mkstemp(prefix=path.name, dir=path.parent)
-    except OSError:
-        return
-    try:
-        with open(handle, "w", encoding="utf-8") as file:
-            file.write(text)
-        os.replace(temporary, path)
-    except OSError:
-        Path(temporary).unlink(missing_ok=True)
+    minor = ".".join(jaxlib.split(".")[:2])
+    new = with_flags(present, XLA_FLAGS.get(minor, ()) if work >= FLAGS_FROM else ())
+    return found if new.split() == present.split() else found | {"XLA_FLAGS": new}
 
 
 def _say(text: str) -> None:
@@ -269,7 +184,7 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
         gpu=has_gpu(env),
         cache=cache,
         cores=cores(),
-        works=lambda flags: remembered(flags, folder),
+        jaxlib=importlib.metadata.version("jaxlib"),
     )
     hint = "(--tune_runtime=off sets none)"
     if _AT_START.keys() & new.keys() and GUARD not in env and sys.executable:

@@ -8,7 +8,6 @@ the run; a second Ctrl-C or SIGTERM ends it at once.
 import contextlib
 import dataclasses
 import functools
-import importlib.util
 import os
 import signal
 from collections.abc import Callable
@@ -19,12 +18,12 @@ from absl import flags
 from srl_jax import display, envs
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.resuming import all_to_resume, blank, going_on, is_run, say_anew
 from srl_jax.rundir import check_free, run_directory
-from srl_jax.training import check_game, resolved
+from srl_jax.training import check_game, check_sources, resolved
 
 from . import flags as config_flags
 from . import runtime
-from .directories import all_to_resume, check_out, going_on, say_anew
 from .stopping import signals
 
 FLAGS = flags.FLAGS
@@ -53,6 +52,59 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_boolean(
         "print_config", False, "print the resolved config as JSON and exit", flag_values=values
     )
+    flags.DEFINE_boolean(
+        "dry_run",
+        False,
+        "check everything, print the resolved config as JSON, say where the run would be written, and exit",
+        flag_values=values,
+    )
+
+
+def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:
+    """Whether a run can be written there; writes nothing.
+
+    Args:
+        out: the path, or None where it was not given.
+        config: what it starts from must not be deleted.
+        overwrite: a run that lies there may be deleted.
+        resume: whether a run that lies there will be resumed.
+
+    Returns:
+        The path.
+
+    Raises:
+        ConfigError: it cannot.
+    """
+    if not out:
+        raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
+    if overwrite and resume:
+        raise ConfigError("--resume=auto: resumes the run that --overwrite deletes; give one of them")
+    path = config_flags.check_place("out", out)
+    try:
+        problem = "" if blank(path) else _why_not(path, config, overwrite, resume)
+    except OSError as error:
+        problem = str(error.strerror)
+    if problem:
+        raise ConfigError(f"--out={out}: {problem}")
+    return path
+
+
+def _why_not(path: Path, config: Config, overwrite: bool, resume: bool) -> str:
+    """Why a directory in which something lies cannot be resumed or deleted; "" where it can."""
+    if resume:
+        return "" if is_run(path) else "not a run directory, so --resume=auto cannot resume it"
+    if not overwrite:
+        return "not empty; name a new directory, or --resume=auto resumes the run, or --overwrite deletes it"
+    if path.is_symlink():
+        return "a link, so --overwrite does not delete it; name what it leads to"
+    if not is_run(path):
+        return "not a run directory, so --overwrite does not delete it"
+    for flag in SOURCES:
+        source = getattr(config, flag)
+        if source and Path(source).resolve().is_relative_to(path.resolve()):
+            return f"--overwrite would delete --{flag}={source}"
+    own = Path.cwd().is_relative_to(path.resolve())
+    return "--overwrite would delete the working directory" if own else ""
 
 
 def check_seeds(values: flags.FlagValues) -> list[int]:
@@ -84,8 +136,6 @@ def check_extras(config: Config) -> None:
         ConfigError: they cannot; the line says why, or which extra has the package.
     """
     check_game(config)
-    if config.tensorboard and importlib.util.find_spec("tensorboardX") is None:
-        raise ConfigError("--tensorboard: needs tensorboardX, pip install 'srl-jax[tensorboard]'")
 
 
 def say_unused(values: flags.FlagValues, game: str) -> None:
@@ -140,7 +190,8 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     check_extras(config)
     if not resume:
         check_paths(config)
-    if prepare is not None:
+    dry = values["dry_run"].value
+    if prepare is not None and not dry:
         prepare(values["tune_runtime"].value, config.encoder)
     runtime.check_device()
     config = resolved(config)
@@ -156,8 +207,14 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     # A checkpoint has the encoder; the policy that others are pretrained on is read again.
     needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
     check_paths(needed)
-    checkpoint.check_sources(needed)
+    check_sources(needed)
     config_flags.say_what_is_replaced(values)
+    if dry:
+        display.result(config.to_json())
+        for (directory, _), manifest in zip(runs, manifests, strict=True):
+            how = f"would resume from {manifest.env_steps} env steps" if manifest else "would begin"
+            display.say(f"dry run: nothing is written; a run {how} in {directory}")
+        return 0
     if not resume and not values["overwrite"].value:
         for directory, _ in runs:
             say_anew(directory)
@@ -193,7 +250,7 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
         SaveError: they cannot be written.
     """
     from . import plots
-    from .draw import draw_run
+    from .run_figures import draw_run
 
     if not plots.available():
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")

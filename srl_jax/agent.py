@@ -1,7 +1,8 @@
 """Builds an agent from a configuration: encoder, objectives, jitted functions that init, update and act."""
 
 import inspect
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple, Protocol
 
 import jax
@@ -10,7 +11,7 @@ from jax.typing import ArrayLike
 
 from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
-from srl_jax.diagnostics.device import Functions, make_functions
+from srl_jax.diagnostics.functions import Functions, make_functions
 from srl_jax.modes import MODES, Mode, encoder_learning_rate, second_learning_rate
 from srl_jax.optim import RL, make_optimizer
 from srl_jax.rl import Algorithm
@@ -142,6 +143,27 @@ class Agent(NamedTuple):
     measures: Functions
 
 
+def components(
+    config: Config, frame_shape: tuple[int, int, int], num_actions: int
+) -> tuple[Encoder, Algorithm, dict[str, Objective]]:
+    """The encoder, the RL algorithm and the representation objectives that a configuration names.
+
+    Args:
+        config, frame_shape, num_actions: see `make_agent`.
+
+    Raises:
+        srl_jax.specs.SpecError: where a spec does not fit.
+    """
+    height, width, channels = frame_shape
+    shape = (height, width, config.frame_stack * channels)
+    encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
+    context = Context.of(encoder, num_actions)
+    algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
+    parsed = [specs.parse(text, objectives.REGISTRY, "objective") for text in config.objectives]
+    terms = {spec.name: specs.build(spec, objectives.REGISTRY, context) for spec in parsed}
+    return encoder, algorithm, terms
+
+
 def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: int) -> Agent:
     """Builds an `Agent`.
 
@@ -154,19 +176,11 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         srl_jax.specs.SpecError: where a spec does not fit.
     """
     mode = MODES[config.mode]
-    height, width, channels = frame_shape
-    shape = (height, width, config.frame_stack * channels)
-    encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
-    context = Context.of(encoder, num_actions)
-    algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
-    terms: dict[str, Objective] = {}
+    encoder, algorithm, terms = components(config, frame_shape, num_actions)
+    if not mode.representation:
+        terms = {}
     if mode.rl:
-        slow = periodic(config.slow_update_every)
-        terms[RL] = algorithm.objective._replace(slow=slow)
-    if mode.representation:
-        for text in config.objectives:
-            spec = specs.parse(text, objectives.REGISTRY, "objective")
-            terms[spec.name] = specs.build(spec, objectives.REGISTRY, context)
+        terms = {RL: algorithm.objective._replace(slow=periodic(config.slow_update_every)), **terms}
     optimizer = make_optimizer(
         terms,
         decoder_weight_decay=config.decoder_weight_decay,
@@ -180,33 +194,16 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         "representation": config.lr_srl,
     }
 
-    def jitted_update(only: Collection[str]) -> Update:
-        update = make_update(
-            encoder,
-            terms,
-            mode,
-            optimizer,
-            augment=config.augment,
-            target_encoder=config.target_encoder,
-            encoder_optimizer=config.encoder_optimizer,
-            only=only,
-            slow_follows=False,
-        )
-        plan = passes(mode, [name for name in terms if name in only], config.encoder_optimizer)
-        return Update(update, plan)
+    def jitted_update(plan: Sequence[Pass]) -> Update:
+        how = partial(make_update, plan=plan, augment=config.augment, slow_follows=False)
+        return Update(how(encoder, terms, mode, optimizer), plan)
 
     def jitted_act(noisy: bool) -> Act:
         act = make_act(encoder, algorithm.q_values, noisy=noisy)
         return jax.jit(lambda params, *rest: act(params["encoder"], params[RL], *rest))
 
-    init = make_init(
-        encoder,
-        terms,
-        mode,
-        optimizer,
-        target_encoder=config.target_encoder,
-        encoder_optimizer=config.encoder_optimizer,
-    )
+    plan = passes(mode, terms, config.encoder_optimizer)
+    init = make_init(encoder, terms, mode, optimizer, plan=plan, target_encoder=config.target_encoder)
     return Agent(
         mode=mode,
         encoder=encoder,
@@ -215,8 +212,8 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         horizon=max(1, *(o.horizon for o in terms.values())),
         # It runs once: compile it fast.
         init=jax.jit(init, compiler_options={"xla_backend_optimization_level": 0}),
-        update=jitted_update(terms.keys()),
-        update_rl=jitted_update({RL}) if config.srl_every > 1 else None,
+        update=jitted_update(plan),
+        update_rl=jitted_update(passes(mode, [RL])) if config.srl_every > 1 else None,
         follow=jax.jit(make_follow(terms)),
         follow_every=follow_every(terms),
         act=jitted_act(noisy=True),
@@ -226,14 +223,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},
         ),
-        measures=make_functions(
-            encoder,
-            terms,
-            mode,
-            channels=channels,
-            augment=config.augment,
-            target_encoder=config.target_encoder,
-        ),
+        measures=make_functions(encoder, terms, mode, channels=frame_shape[-1], augment=config.augment),
     )
 
 
@@ -247,7 +237,7 @@ class Seeds(NamedTuple):
         follow: TrainState -> TrainState.
         act: (params, [frames uint8 [N, S, H, W]], [key], step, epsilon) -> actions.
         stack: [tree of each seed] -> tree.
-        part: (tree, i) -> the tree of seed i, on the device.
+        parts: tree -> the tree of each seed in turn, on the device.
         rows: tree -> [tree of each seed], on the host; waits for the device.
     """
 
@@ -256,7 +246,7 @@ class Seeds(NamedTuple):
     follow: Callable
     act: Callable
     stack: Callable
-    part: Callable
+    parts: Callable[[Any], Iterable[Any]]
     rows: Callable
 
 
@@ -276,7 +266,7 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
             follow=agent.follow,
             act=lambda params, frames, keys, *now: agent.act(params, frames[0], keys[0], *now),
             stack=lambda trees: trees[0],
-            part=lambda tree, i: tree,
+            parts=lambda tree: [tree],
             rows=lambda tree: [jax.device_get(tree)],
         )
 
@@ -292,6 +282,8 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
 
     act = jax.vmap(inspect.unwrap(agent.act), in_axes=(0, 0, 0, None, None))
 
+    part = jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree))
+
     def rows(tree: Any) -> list[Any]:
         tree = jax.device_get(tree)
         return [jax.tree.map(lambda x: x[i], tree) for i in range(number)]  # noqa: B023
@@ -302,6 +294,6 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
         follow=jax.jit(jax.vmap(inspect.unwrap(agent.follow))),
         act=jax.jit(lambda params, frames, keys, *now: act(params, jnp.stack(frames), jnp.stack(keys), *now)),
         stack=jax.jit(stacked),
-        part=jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree)),
+        parts=lambda tree: (part(tree, i) for i in range(number)),
         rows=rows,
     )

@@ -17,7 +17,6 @@ import hashlib
 import io
 import json
 import os
-import re
 import shutil
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -193,34 +192,26 @@ def _put_in_place(temporary: Path, final: Path) -> None:
 
 
 def slim(manifest: Manifest) -> Manifest:
-    """Rewrites a checkpoint from which nobody will go on: what `State` brought in is removed.
+    """Rewrites a checkpoint from which nobody will resume: what `State` brought in is removed.
 
     Raises:
         SaveError: it could not be written; the checkpoint is whole, as it was or slim.
     """
-    final = manifest.path
-    temporary = final.parent / f".{final.name}.partial"
-    slimmed = manifest._replace(files={PARAMS: manifest.files[PARAMS]})
-    try:
-        temporary.mkdir()
-        if not _link(manifest, PARAMS, temporary):
-            shutil.copyfile(final / PARAMS, temporary / PARAMS)
-        sign(temporary, _about(slimmed))
-        _put_in_place(temporary, final)
-    except OSError as error:
-        shutil.rmtree(temporary, ignore_errors=True)
-        raise SaveError(f"{final}: not rewritten: {error.strerror or error}") from error
-    return slimmed
+    folder = manifest.path.parent
+    about = manifest._asdict()
+    del about["path"], about["files"]
+    return save(folder.parent, load(manifest), **about, keep=0, folder=folder.name)
 
 
 def sign(folder: Path, about: Mapping[str, Any]) -> None:
     """Writes a manifest and its sum."""
-    entry = write(folder / MANIFEST, json.dumps(dict(about), indent=1).encode())
-    write(folder / CHECKSUM, _sum_line(entry.sha256))
+    data = json.dumps(dict(about), indent=1).encode()
+    write(folder / MANIFEST, data)
+    write(folder / CHECKSUM, _sum_line(data))
 
 
-def _sum_line(digest: str) -> bytes:
-    return f"{digest}  {MANIFEST}\n".encode()
+def _sum_line(data: bytes) -> bytes:
+    return f"{hashlib.sha256(data).hexdigest()}  {MANIFEST}\n".encode()
 
 
 def write(path: Path, *pieces: bytes | memoryview) -> Entry:
@@ -233,10 +224,6 @@ def write(path: Path, *pieces: bytes | memoryview) -> Entry:
         file.flush()
         os.fsync(file.fileno())
     return Entry(sum(memoryview(piece).nbytes for piece in pieces), digest.hexdigest())
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
 
 
 # Reading
@@ -258,13 +245,13 @@ def read_manifest(path: str | Path) -> Manifest:
     if path == given and not any(os.path.lexists(path / name) for name in (MANIFEST, CHECKSUM)):
         raise ConfigError(f"{path}: no checkpoint there; name a run directory or one of its checkpoints")
     data = _read(path / MANIFEST)
-    if _read(path / CHECKSUM) != _sum_line(_sha256(data)):
+    if _read(path / CHECKSUM) != _sum_line(data):
         raise ConfigError(f"{path / MANIFEST}: damaged: its sha256 is not the one in {CHECKSUM}")
     about = json.loads(data)
     if about["format"] != FORMAT:
         raise ConfigError(f"{path}: checkpoint of format {about['format']}, not {FORMAT}")
     try:
-        config = Config.from_json(json.dumps(about["config"]))
+        config = Config.from_values(about["config"])
     except ConfigError as error:  # of another version
         raise ConfigError(f"{path / MANIFEST}: {error}") from None
     counts = {name: about[name] for name in ("num_actions", "env_steps", "updates")}
@@ -359,17 +346,17 @@ class Arrays(Mapping):
 
     def __init__(self, manifest: Manifest, prefix: str):
         self._manifest, self._prefix = manifest, prefix
-        names = [Path(file).stem for file in manifest.files if file.endswith(".npy")]
-        self._names = [name.removeprefix(prefix) for name in names if name.startswith(prefix)]
+        names = (Path(file).stem for file in manifest.files if file.endswith(".npy"))
+        self._names = {name.removeprefix(prefix): name for name in names if name.startswith(prefix)}
 
     def __getitem__(self, name: str) -> np.ndarray:
         return load_array(self._manifest, self._prefix + name)
 
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._names)
-
     def __contains__(self, name: object) -> bool:
         return name in self._names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._names)
 
     def __len__(self) -> int:
         return len(self._names)
@@ -385,7 +372,7 @@ def _checked(manifest: Manifest, file: str) -> bytes:
     """A file's content, if it has the sum that the manifest says."""
     path, entry = _entry(manifest, file)
     data = _read(path)
-    if _sha256(data) != entry.sha256:
+    if hashlib.sha256(data).hexdigest() != entry.sha256:
         raise ConfigError(f"{path}: damaged: its sha256 is not the manifest's")
     return data
 
@@ -429,42 +416,6 @@ def _flat(tree: dict[str, Any]) -> dict[str, Any]:
     return traverse_util.flatten_dict(tree, keep_empty_nodes=True, sep="/")
 
 
-_SAME = {
-    "encoder_from": {
-        "encoder": "architecture",
-        "frame_size": "preprocessing",
-        "frame_stack": "preprocessing",
-    },
-    "policy_from": {"game": "game", "frame_size": "preprocessing", "frame_stack": "preprocessing"},
-}
-"""What a run must have in common with the one that a flag names."""
-
-
-def check_sources(config: Config) -> None:
-    """Whether the checkpoints that a run wants to start from exist and fit it; reads manifests alone.
-
-    Raises:
-        ConfigError: one line that names the flag and what differs.
-    """
-    for flag, fields in _SAME.items():
-        if not (path := getattr(config, flag)):
-            continue
-        try:
-            found = read_manifest(path).config
-        except ConfigError as error:
-            raise ConfigError(f"--{flag}={path}: {error}") from None
-        if flag == "policy_from" and found.mode == "pretrain":
-            raise ConfigError(
-                f"--{flag}={path}: a representation run has no policy; name a run of another mode"
-            )
-        for field, what in fields.items():
-            ours, theirs = getattr(config, field), getattr(found, field)
-            if ours != theirs:
-                raise ConfigError(
-                    f"--{flag}={path}: the {what} differs: {field} is {theirs} there and {ours} here"
-                )
-
-
 def check_frames(manifest: Manifest, frame_shape: tuple, what: str, game: str) -> None:
     """Whether a checkpoint's encoder has seen frames of the shape (H, W, C) that a game shows.
 
@@ -485,7 +436,7 @@ def _all(folder: Path) -> list[Path]:
     """The checkpoints of a folder, oldest first; whether they are whole, their manifests tell."""
     if not os.path.isdir(folder):
         return []
-    found = [p for p in folder.glob("[0-9]*") if re.fullmatch("[0-9]+", p.name) and p.is_dir()]
+    found = [p for p in folder.glob("[0-9]*") if p.name.isdecimal() and p.is_dir()]
     return sorted(found, key=lambda p: int(p.name))  # names have 9 digits, but more from a billion steps on
 
 

@@ -6,28 +6,15 @@ code. An "env step" is one decision of the agent, which is four emulator frames 
 """
 
 import dataclasses
-import importlib.metadata
 import json
-import os
-import platform
-import subprocess
-import time
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from srl_jax import envs, modes, specs
+from srl_jax import envs, modes, provenance, specs
 from srl_jax.errors import ConfigError
-from srl_jax.reading import SETTINGS, parse_json, read_bytes, replace_text
+from srl_jax.reading import parse_json, read_json, replace_text
 from srl_jax.specs import Info
-
-_PACKAGES = (
-    "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
-)  # fmt: skip
-_MADE_BY = ("versions", "git_revision", "environment", "cpus")
-"""What config.json says of the software and the machine that made a run."""
-_ABOUT = (*_MADE_BY, "started", "continued")
-"""What config.json holds beside the fields of Config."""
 
 SOURCES = ("encoder_from", "policy_from")
 """The fields that name another run."""
@@ -35,8 +22,7 @@ SOURCES = ("encoder_from", "policy_from")
 _RENAMED = {"lr_final": "lr_final_share"}
 """Fields of earlier config.json files by the names that they have now."""
 
-PARTIAL = "config.json.partial"
-"""The name under which it is written, so that no process that is killed leaves half of it."""
+FILE = "config.json"
 
 
 def _value(kind: type, default: Any, help: str, unit: str = "", **limits: Any) -> Any:
@@ -178,7 +164,12 @@ class Config:
         int, 10, "epochs whose encoders and decoders are kept in encoders/, to measure drift against",
         "epochs", minimum=0, maximum=1_000,
     )  # fmt: skip
-    tensorboard: bool = _value(bool, False, "also write TensorBoard events")
+    loggers: tuple[str, ...] = _value(
+        tuple, (),
+        "where rows go beside metrics.jsonl: tensorboard, wandb, csv, or module:Logger, a class of your own "
+        "(see srl_jax/loggers.py); may be repeated, or a list with commas; none stands for no logger",
+        flag="logger",
+    )  # fmt: skip
 
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
     life_loss: bool = _value(bool, True, "a lost life ends the return, but not the game, in training")
@@ -215,7 +206,7 @@ class Config:
     pretrain_epsilon: float = _share(0.3, "epsilon of the behaviour policy in --mode=pretrain")
     imports: tuple[str, ...] = _value(
         tuple, (),
-        "file (my_file.py) or module that registers objectives, encoders or RL algorithms of your own, see "
+        "file (my_file.py) or module that registers own objectives, encoders, RL algorithms or loggers, see "
         "srl_jax/plugins.py; may be repeated",
         flag="import",
     )  # fmt: skip
@@ -264,18 +255,26 @@ class Config:
 
     @classmethod
     def from_json(cls, text: str | bytes) -> "Config":
-        """Reads `to_json`'s text, or a run's config.json. A missing field takes its default.
+        """Reads `to_json`'s text, or a run's config.json; see `from_values`."""
+        try:
+            return cls.from_values(parse_json(text))
+        except ConfigError:
+            raise
+        except ValueError as error:
+            raise ConfigError(f"config: not JSON: {error}") from None
+
+    @classmethod
+    def from_values(cls, values: Any) -> "Config":
+        """A Config from its fields, and what else config.json has. A missing field takes its default.
 
         Raises:
             ConfigError: not a JSON object, an unknown field, or a value out of its limits.
         """
-        try:
-            values = parse_json(text)
-        except ValueError as error:
-            raise ConfigError(f"config: not JSON: {error}") from None
         if not isinstance(values, dict):
             raise ConfigError("config: not a JSON object")
-        values = {_RENAMED.get(name, name): value for name, value in values.items() if name not in _ABOUT}
+        values = {_RENAMED.get(name, name): x for name, x in values.items() if name not in provenance.ABOUT}
+        if values.pop("tensorboard", False):  # before there were loggers
+            values.setdefault("loggers", ["tensorboard"])
         for name in values:
             if name not in INFOS:
                 raise ConfigError(f"config: no field {name!r}; {specs.choices_text(name, INFOS)}")
@@ -283,24 +282,35 @@ class Config:
 
     @classmethod
     def load(cls, run: str | Path) -> "Config":
-        """Reads config.json of a run directory.
-
-        Raises:
-            ConfigError: there is none, or it is not a Config.
-        """
-        path = Path(run) / "config.json"
-        try:
-            return cls.from_json(read_bytes(path, SETTINGS))
-        except OSError as error:
-            raise ConfigError(f"{path}: {error.strerror}; not a run directory") from None
-        except ConfigError as error:
-            raise ConfigError(f"{path}: {error}") from None
+        """Reads config.json of a run directory; raises as `read`."""
+        return read(run)[0]
 
     def save(self, run: str | Path) -> None:
-        """Writes a run's config.json: the fields, package versions, git revision, and what XLA was told; also
-        when the run began (UTC), and how many CPUs the machine has. `record_changes` adds to it.
-        """
-        _write(run, {**dataclasses.asdict(self), **_made_by(), "started": _now()})
+        """Writes a run's config.json: the fields, what made the run, and when it began (UTC)."""
+        write(run, {**dataclasses.asdict(self), **provenance.made_by(), "started": provenance.now()})
+
+
+def read(run: str | Path) -> tuple[Config, dict[str, Any]]:
+    """What config.json of a run directory says: the settings, and all of its content.
+
+    Raises:
+        ConfigError: there is none, or it is not a Config.
+    """
+    path = Path(run) / FILE
+    try:
+        about = read_json(path)
+    except ConfigError as error:
+        hint = "; not a run directory" if isinstance(error.__cause__, OSError) else ""
+        raise ConfigError(f"{error}{hint}") from None
+    try:
+        return Config.from_values(about), about
+    except ConfigError as error:
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def write(run: str | Path, about: Mapping[str, Any]) -> None:
+    """Writes all of a run's config.json."""
+    replace_text(Path(run) / FILE, json.dumps(about, indent=2) + "\n")
 
 
 INFOS: dict[str, Info] = {f.name: f.metadata["info"] for f in dataclasses.fields(Config)}
@@ -361,8 +371,8 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
 
 
-MAY_CHANGE = ("steps", "stop_at_return", "keep_replay", "keep_best", "imports")
-"""Fields that may change when a run is resumed: when it ends, what it leaves, where its plug-ins lie."""
+MAY_CHANGE = ("steps", "stop_at_return", "keep_replay", "keep_best", "imports", "loggers")
+"""Fields that may change when a run is resumed: when it ends, what it leaves, its plug-ins and loggers."""
 
 
 def another_run(there: Config, here: Config) -> str:
@@ -370,132 +380,3 @@ def another_run(there: Config, here: Config) -> str:
     same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
     same |= {name: getattr(there, name) for name in MAY_CHANGE}
     return difference(there, dataclasses.replace(here, **same))
-
-
-def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What made a run: {package, environment variable, "git_revision" or "cpus": its values, oldest first}.
-
-    Args:
-        about: the content of config.json. What it does not say at all is left out.
-
-    Raises:
-        ValueError, TypeError, KeyError, AttributeError: it is not what training writes.
-    """
-    found = {name: [value] for name, value in _flat(about).items()}
-    for continued in about.get("continued", []):
-        for name, value in continued["changed"].items():
-            found.setdefault(name, [None]).append(value)
-    return found
-
-
-def changes(run: str | Path) -> dict[str, tuple[Any, Any]]:
-    """What is different now of what made a run: {name: (then, now)}, as of `history`; None for nothing.
-
-    Raises:
-        ConfigError: config.json is not what training writes.
-    """
-    about, past = _read(run)
-    then = {name: values[-1] for name, values in past.items()}
-    now = _flat({name: value for name, value in _made_by().items() if name in about})
-    pairs = {name: (then.get(name), now.get(name)) for name in {**then, **now}}
-    return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
-
-
-def record_changes(run: str | Path, env_steps: int, config: Config) -> None:
-    """Brings a run's config.json up to date: `MAY_CHANGE`, and `changes` under "continued".
-
-    Writes nothing where nothing has changed.
-
-    Args:
-        run: its directory, held by this process.
-        env_steps: from which it is resumed.
-        config: that it is resumed with.
-
-    Raises:
-        ConfigError: config.json is not what training writes.
-        OSError: it could not be written.
-    """
-    about, _ = _read(run)
-    values = json.loads(config.to_json())
-    settings = {name: values[name] for name in MAY_CHANGE if about.get(name, values[name]) != values[name]}
-    changed = {name: now for name, (_, now) in changes(run).items()}
-    if settings or changed:
-        continued = {"env_steps": env_steps, "started": _now(), "changed": changed, "settings": settings}
-        _write(run, {**about, **settings, "continued": [*about.get("continued", []), continued]})
-
-
-def _read(run: str | Path) -> tuple[dict[str, Any], dict[str, list[Any]]]:
-    """The content of config.json and its `history`."""
-    path = Path(run) / "config.json"
-    try:
-        about = parse_json(read_bytes(path, SETTINGS))
-        return about, history(about)
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
-    except (ValueError, TypeError, KeyError, AttributeError):
-        raise ConfigError(f"{path}: what it says of versions is not what training writes") from None
-
-
-def _write(run: str | Path, content: Mapping[str, Any]) -> None:
-    replace_text(Path(run) / "config.json", json.dumps(content, indent=2) + "\n")
-
-
-def _now() -> str:
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime())
-
-
-def _made_by() -> dict[str, Any]:
-    values = versions(), git_revision(), told_to_xla(), os.cpu_count()
-    return dict(zip(_MADE_BY, values, strict=True))
-
-
-def _flat(about: Mapping[str, Any]) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    for name in _MADE_BY:
-        if name in about:
-            found |= about[name] if isinstance(about[name], dict) else {name: about[name]}
-    return found
-
-
-def told_to_xla() -> dict[str, str]:
-    """The environment variables that change an update's roundings."""
-    return {name: os.environ[name] for name in ("XLA_FLAGS", "NPROC", "JAX_PLATFORMS") if name in os.environ}
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python, the platform and the packages that a run's numbers depend on."""
-    found = {"python": platform.python_version(), "platform": platform.platform()}
-    for package in _PACKAGES:
-        try:
-            found[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            pass  # An extra that is not installed, or a checkout that is run in place.
-    return found
-
-
-def git_revision() -> str | None:
-    """The commit of the checkout that this package lies in, `-dirty` if tracked files differ from
-    it.
-
-    None where there is no git, no commit, or the package is merely installed below another
-    checkout.
-    """
-    root = Path(__file__).resolve().parents[1]
-
-    def git(*arguments: str) -> str:
-        done = subprocess.run(
-            ["git", "-C", str(root), *arguments],
-            capture_output=True,
-            text=True,
-            timeout=10,
-            check=True,
-        )
-        return done.stdout.strip()
-
-    try:
-        if Path(git("rev-parse", "--show-toplevel")).resolve() != root:
-            return None
-        revision = git("rev-parse", "--verify", "HEAD")
-        return revision + ("-dirty" if git("status", "--porcelain", "--untracked-files=no") else "")
-    except (OSError, subprocess.SubprocessError):
-        return None

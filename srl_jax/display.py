@@ -4,8 +4,11 @@ import errno
 import io
 import os
 import sys
+import threading
 from collections.abc import Callable
 from typing import Any, TextIO
+
+from tqdm import tqdm
 
 from srl_jax.errors import SaveError
 
@@ -69,6 +72,103 @@ class Display:
             except (OSError, ValueError) as error:  # ValueError: somebody has closed it
                 self.lost = error
         return None
+
+
+class _Lines:
+    """A stream for a bar where nothing can be drawn over: each state that is drawn becomes a line.
+
+    Args:
+        write: takes a line, with its end.
+    """
+
+    def __init__(self, write: Callable[[str], Any]):
+        self._write = write
+
+    def write(self, text: str) -> None:
+        """Writes a line, less what moves the cursor and what wipes the line before."""
+        if text.strip():
+            self._write(text.strip() + "\n")
+
+
+class Progress:
+    """A bar of tqdm: drawn in place on a terminal, a line every ten seconds elsewhere.
+
+    Args:
+        total: what `done` will be at the end.
+        unit: what `done` counts.
+        stream: where to draw; None for stderr.
+    """
+
+    def __init__(self, total: int, unit: str = "env steps", stream: TextIO | Display | None = None):
+        self._total, self._unit = total, unit
+        self._stream = Display(sys.stderr if stream is None else stream)
+        self._tty = self._stream.isatty()
+        self._bar: _Bar | None = None
+        self._fields: dict[str, Any] = {}
+
+    def update(self, done: int, **fields: Any) -> None:
+        """Says how far it is; draws if the last drawing is old enough.
+
+        Args:
+            done: counted from the start of the run.
+            **fields: numbers or strings to show, kept until given again; None takes one away.
+        """
+        if self._bar is None:
+            interval = 0.25 if self._tty else 10.0
+            self._bar = _Bar(
+                total=self._total,
+                unit=f" {self._unit}",
+                initial=done,
+                file=self._stream if self._tty else _Lines(self._write),
+                mininterval=interval,
+                miniters=0,  # ask the clock at each update: their rate is not steady
+                smoothing=interval / 30,  # the rate is of about the last 30 seconds
+                dynamic_ncols=self._tty,
+                ascii=None if self._tty else True,
+                position=0,
+            )
+        if fields:
+            self._fields |= fields
+            shown = {name: x for name, x in self._fields.items() if x is not None}
+            self._bar.set_postfix(shown, refresh=False)
+        self._bar.update(done - self._bar.n)
+
+    def note(self, text: str) -> None:
+        """Prints a line of its own above the bar."""
+        drawn = self._bar if self._tty else None
+        if drawn is not None:
+            drawn.clear()
+        self._write(text + "\n")
+        if drawn is not None:
+            drawn.refresh()
+
+    def close(self) -> None:
+        """Draws the last state and ends the line. A second call does nothing."""
+        if self._bar is not None:
+            self._bar.close()
+
+    def __enter__(self) -> "Progress":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def _write(self, text: str) -> None:
+        self._stream.write(text)
+        self._stream.flush()
+
+
+class _Bar(tqdm):
+    monitor_interval = 0  # else it has a thread that draws
+
+
+_Bar.set_lock(threading.RLock())  # else one for other processes, too, which takes a semaphore
+
+
+def hms(seconds: float) -> str:
+    """A duration in seconds as h:mm:ss."""
+    whole = max(int(round(seconds)), 0)
+    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
 def say(line: str) -> None:

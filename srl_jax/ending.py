@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from srl_jax.errors import ConfigError, Diverged, SaveError, saving
-from srl_jax.reading import SETTINGS, parse_json, read_bytes, replace_text
+from srl_jax.reading import read_json, replace_text
 
 FILE = "ended.json"
 STATUSES = ("finished", "stopped", "diverged", "failed")
@@ -70,7 +70,12 @@ def read(run: Path) -> Ending | None:
     """
     path = run / FILE
     try:
-        values = parse_json(read_bytes(path, SETTINGS))
+        values = read_json(path)
+    except ConfigError as error:
+        if isinstance(error.__cause__, FileNotFoundError):
+            return None
+        raise
+    try:
         ending = Ending(**values)
         if (
             ending.status not in STATUSES
@@ -78,10 +83,6 @@ def read(run: Path) -> Ending | None:
             or type(ending.reason) is not str
         ):
             raise ValueError("not an ending")
-    except FileNotFoundError:
-        return None
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
     except (ValueError, TypeError) as error:
         raise ConfigError(f"{path}: not what training writes ({str(error)[:100]})") from None
     return ending

@@ -52,17 +52,16 @@ def evaluate(
         stop: asked before every step; once it says so, the games are left and there is no result.
         told: after every step, how many each environment has taken and how many games have been played.
     """
-    number = env.num_envs
-    shape = env.single_observation_space.shape
+    number, shape = env.num_envs, env.single_observation_space.shape
     stacks = FrameStack(number, stack, shape)
     frames, _ = env.reset(seed=seed)
     stacks.begin(frames)
-    scores: list[list[tuple[float, int]]] = [[] for _ in range(number)]
-    share = [len(range(i, games, number)) for i in range(number)]
+    returns, lengths = np.zeros(games), np.zeros(games, int)
     score, length = np.zeros(number), np.zeros(number, int)
+    game = np.arange(number)  # that each environment plays; from `games` on they do not count
     recorded = [frames[0]][:record]
-    step = 0
-    while any(len(done) < wanted for done, wanted in zip(scores, share, strict=True)):
+    step = played = 0
+    while played < games:
         if stop():
             return None
         frames, rewards, terminated, truncated, _ = env.step(policy(stacks.observations(), step, epsilon))
@@ -70,21 +69,19 @@ def evaluate(
         score += rewards
         length += 1
         stacks.push(frames)
-        if len(recorded) < record and len(scores[0]) < share[0]:
+        if len(recorded) < record and game[0] < games:
             recorded.append(frames[0])
         over = terminated | truncated | (length >= max_steps)
         if over.any():
-            for i in np.flatnonzero(over):
-                scores[i].append((float(score[i]), int(length[i])))
+            counts = over & (game < games)
+            returns[game[counts]], lengths[game[counts]] = score[counts], length[counts]
+            played += int(counts.sum())
+            game[over] += number
             score[over], length[over] = 0.0, 0
             frames, _ = env.reset(options={"reset_mask": over})
             stacks.begin(frames, over)
-            if over[0] and len(recorded) < record and len(scores[0]) < share[0]:
+            if over[0] and len(recorded) < record and game[0] < games:
                 recorded.append(frames[0])
-        told(step, sum(map(min, map(len, scores), share)))
-    played = [scores[i % number][i // number] for i in range(games)]
-    return Evaluation(
-        returns=[r for r, _ in played],
-        lengths=[n for _, n in played],
-        frames=np.stack(recorded) if recorded else np.zeros((0, *shape), np.uint8),
-    )
+        told(step, played)
+    seen = np.stack(recorded) if recorded else np.zeros((0, *shape), np.uint8)
+    return Evaluation(returns.tolist(), lengths.tolist(), seen)

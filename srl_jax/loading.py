@@ -15,6 +15,7 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.optim import ENCODER, RL
 from srl_jax.types import Array, Encoder, Params
+from srl_jax.update import epsilon_greedy
 
 
 class Loaded:
@@ -76,13 +77,10 @@ class Loaded:
         Raises:
             srl_jax.errors.ConfigError, ValueError: see `q_values`.
         """
-        values = np.asarray(self.q_values(observations))
-        actions = np.argmax(values, -1).astype(np.int32)
-        if epsilon > 0:
-            rng = rng or self._rng
-            random = rng.integers(0, values.shape[-1], actions.shape, np.int32)
-            actions = np.where(rng.random(actions.shape) < epsilon, random, actions)
-        return actions
+        values = self.q_values(observations)
+        key = jax.random.key((rng or self._rng).integers(2**31) if epsilon > 0 else 0)
+        coin_key, action_key = jax.random.split(key)
+        return np.array(epsilon_greedy(values, coin_key, action_key, epsilon))
 
     def policy(self, key: jax.Array) -> Policy:
         """The epsilon-greedy policy that evaluations play, see `greedy_policy`.

@@ -8,9 +8,7 @@ their own and are awaited before the next row is written. So no result depends o
 
 import contextlib
 import dataclasses
-import time
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,9 +23,9 @@ from srl_jax.config import Config
 from srl_jax.diagnostics.pictures import pictures
 from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, Diverged, SaveError
-from srl_jax.loading import given_policy, greedy_policy, initial_params
+from srl_jax.loading import given_policy, initial_params
 from srl_jax.schedules import Now, Schedules, passed
-from srl_jax.seed import Seed, Step
+from srl_jax.seed import Seed
 from srl_jax.types import Params
 from srl_jax.update import named_key
 
@@ -81,8 +79,8 @@ def train_seeds(
         progress: whether to draw a progress bar on stderr, the first seed's.
         resume: a checkpoint of each to resume from, of the same configuration and env step, found whole by
             `srl_jax.checkpoint.verify`; what follows is what would have followed had the run not ended there.
-        stop: asked before each step; once it says so, an evaluation under way is awaited, a checkpoint is
-            written and training ends. A KeyboardInterrupt instead leaves the last checkpoint.
+        stop: asked before each step; once it says so, a checkpoint is written and training ends. A
+            KeyboardInterrupt instead leaves the last checkpoint.
         agent: of this configuration, where it is made already.
 
     Raises:
@@ -108,20 +106,10 @@ def train_seeds(
     return results
 
 
-class Evaluating(NamedTuple):
-    """The evaluation under way: of which moment, its diagnostics and its games, by seed."""
-
-    params: Params
-    env_steps: int
-    updates: int
-    diagnosed: list[dict[str, Any]]
-    games: list[Future]
-
-
 class Run:
     """A run of one seed or several; a context in which its files and threads are open.
 
-    `state`, `env_steps`, `updates`, `seeds`, `waiting` and `evaluating` are all that changes in it.
+    `state`, `env_steps`, `updates`, `seeds` and `waiting` are all that changes in it.
     """
 
     def __init__(
@@ -138,7 +126,6 @@ class Run:
         self.stop = stop
         self.checkpoint_every = config.checkpoint_every or config.eval_every
         self.env_threads = yielding_threads("environments", len(configs))
-        self.eval_threads = yielding_threads("evaluation", len(configs))
         # Environments are made in their threads, so that the threads that they start yield, too.
         envs = list(self.env_threads.map(lambda c: make_env(c, "train", c.num_envs), configs))
         num_actions = int(envs[0].single_action_space.n)
@@ -156,9 +143,6 @@ class Run:
                 seed.policy = policy(named_key(seed.key, "given policy"))
         self.env_steps = self.updates = 0
         self.waiting: list[dict] = []  # metrics of updates, on the device
-        self.evaluating: Evaluating | None = None
-        self.left = False  # nobody waits for the evaluation under way
-        self.resumed = resume is not None
         if resume is None:
             start = initial_params(config, frame, self.agent)
             states = [self.agent.init(seed.key, start) for seed in self.seeds]
@@ -169,18 +153,23 @@ class Run:
 
     def __enter__(self) -> "Run":
         with contextlib.ExitStack() as stack:
+            stack.enter_context(self.env_threads)
             for seed in self.seeds:
-                stack.callback(seed.close)
-            for seed in self.seeds:
-                stack.enter_context(seed.report)
-            for threads in (self.env_threads, self.eval_threads):
-                stack.enter_context(threads)
-            stack.callback(setattr, self, "left", True)
+                seed.open(stack)
             self.opened = stack.pop_all()
         return self
 
     def __exit__(self, *exception) -> None:
         self.opened.__exit__(*exception)
+
+    @property
+    def now(self) -> Now:
+        """The numbers of the schedules, now."""
+        return self.schedules.at(self.env_steps)
+
+    def each(self, tree: Any) -> Iterator[tuple[Seed, Any]]:
+        """The seeds, each with its own of a tree on the device."""
+        return zip(self.seeds, self.device.parts(tree), strict=True)
 
     def train(self) -> list[Result]:
         """Runs to the end, or until it is told to stop."""
@@ -194,49 +183,45 @@ class Run:
                 last = f"the last checkpoint is of {first.saved.env_steps}" if first.saved else ""
                 done = f"interrupted after {self.env_steps} env steps"
                 first.report.progress.note(f"{done}; {last or 'there is no checkpoint'}")
-            self.left = True
             results = []
-            for i, seed in enumerate(self.seeds):
-                params = self.device.part(self.state.params, i)
+            for seed, params in self.each(self.state.params):
                 drawn = pictures(self.agent, params, seed.replay, self.now.beta)
-                saved = seed.saved and seed.saved.env_steps
-                counts = self.env_steps, self.updates, not finished, saved
+                seed.report.pictures(self.env_steps, drawn)
+                counts = self.env_steps, self.updates, not finished, seed.saved and seed.saved.env_steps
                 results.append(Result(*counts, drawn, seed.recording))
         return results
 
     def run(self) -> bool:
         """To the last env step, or to the return that ends the run; False where it was told to stop."""
         config, progress = self.config, self.seeds[0].report.progress
-        if not self.resumed:
+        if self.seeds[0].saved is None:
             self.begin()
-        if not self.resumed or self.seeds[0].evaluation_due:
             self.start_evaluation()
+        else:
+            for seed in self.seeds:
+                seed.play()
         while self.env_steps < config.steps:
             if self.stop():
-                under_way = self.evaluating and not all(game.done() for game in self.evaluating.games)
-                if under_way and not self.is_saved:
-                    awaited = "stopping once the evaluation under way is over"
-                    progress.note(f"{awaited}; a second signal ends at once")
                 self.save()
                 progress.note(f"stopped after {self.env_steps} env steps; a checkpoint is written")
                 return False
             before = self.env_steps
             self.step()
-            log, evaluate, checkpoint = (
+            log, evaluate, save = (
                 passed(before, self.env_steps, every)
                 for every in (config.log_every, config.eval_every, self.checkpoint_every)
             )
-            if log or evaluate:
-                self.finish_evaluation()
-                if all(seed.solved for seed in self.seeds):
-                    break
+            if (log or evaluate) and self.finish_evaluation():
+                break
             if log:
                 self.write_train_rows()
-            if checkpoint and self.env_steps < config.steps:
-                self.keep_encoders()  # first: a run that resumes from the checkpoint does not do it again
-                self.save(evaluation_due=evaluate)
+            save = save and self.env_steps < config.steps
+            if save:
+                self.keep_encoders()
             if evaluate:
                 self.start_evaluation()
+            if save:  # last: a run that resumes from it does none of this again
+                self.save()
             progress.update(self.env_steps)
         self.finish_evaluation()
         self.finish()
@@ -249,11 +234,6 @@ class Run:
         for seed in self.seeds:
             seed.begin()
 
-    @property
-    def now(self) -> Now:
-        """The numbers of the schedules, now."""
-        return self.schedules.at(self.env_steps)
-
     def step(self) -> None:
         """One step of every environment, and the updates that are due."""
         frames = [seed.stacks.observations() for seed in self.seeds]
@@ -263,10 +243,12 @@ class Run:
             for _ in range(self.schedules.updates_due(self.env_steps) - self.updates):
                 self.update()
         for seed, step in zip(self.seeds, stepping.result(), strict=True):
-            seed.take(step)
+            seed.take(*step)
         self.env_steps += self.config.num_envs
 
-    def act_and_step(self, params: Params, frames: list[np.ndarray], step: int, epsilon: float) -> list[Step]:
+    def act_and_step(
+        self, params: Params, frames: list[np.ndarray], step: int, epsilon: float
+    ) -> list[tuple]:
         """Acts, and steps the environments, those of each seed in a thread; runs in one of these threads."""
         if self.agent.mode.rl:
             now = np.int32(step), np.float32(epsilon)
@@ -296,38 +278,34 @@ class Run:
         rows = self.device.rows(td_errors)
         for seed, (_, indices), td_error in zip(self.seeds, sampled, rows, strict=True):
             if not np.isfinite(td_error).all():
-                self.check_losses(seed, "a temporal-difference error")
+                self.fetch()  # a loss says more
+                raise self.diverged(seed, "a temporal-difference error")
             seed.replay.set_priorities(indices, td_error)
 
-    # Rows
+    # Rows and checkpoints
 
     def fetch(self) -> None:
-        """Adds the metrics that wait on the device to the seeds' means."""
-        for seed, rows in zip(self.seeds, self.device.rows(self.waiting), strict=True):
-            for row in rows:
-                seed.report.means.add(row)
-        self.waiting = []
-
-    def check_losses(self, broken: Seed | None = None, what: str = "") -> None:
-        """Whether all losses since the last row were finite.
-
-        Args:
-            broken: a seed that has something else that is not finite.
-            what: that is.
+        """Adds the metrics that wait on the device to the seeds' means; before anything is written.
 
         Raises:
-            Diverged: one was not, or there is something else.
+            Diverged: a loss since the last row was not finite.
         """
-        self.fetch()
+        waiting, self.waiting = self.waiting, []
+        for seed, rows in zip(self.seeds, self.device.rows(waiting), strict=True):
+            for row in rows:
+                seed.report.means.add(row)
         for seed in self.seeds:
-            if name := seed.report.means.broken() or (what if seed is broken else ""):
-                when = f"{self.env_steps} env steps and {self.updates} updates"
-                why = f"{name} is not finite after {when}; the checkpoints are from before"
-                raise Diverged(why, seed.out)
+            if name := seed.report.means.broken():
+                raise self.diverged(seed, name)
+
+    def diverged(self, seed: Seed, what: str) -> Diverged:
+        """The error of a seed that has something that is not finite."""
+        when = f"{self.env_steps} env steps and {self.updates} updates"
+        return Diverged(f"{what} is not finite after {when}; the checkpoints are from before", seed.out)
 
     def write_train_rows(self) -> None:
         """A "train" row of each seed: schedules, and means since the last one."""
-        self.check_losses()
+        self.fetch()
         epsilon, beta, _ = self.now
         for seed in self.seeds:
             values = {"epsilon": epsilon, "beta": beta, "replay/transitions": len(seed.replay)}
@@ -335,97 +313,45 @@ class Run:
 
     def start_evaluation(self) -> None:
         """Measures the latents of now, and has the policies of now evaluated while training goes on."""
-        diagnosed = [self.diagnose(i) for i in range(len(self.seeds))]
-        if self.agent.mode.rl:
-            now = self.state.params, self.env_steps, self.updates
-            games = [self.eval_threads.submit(self.play, i, *now[:2]) for i in range(len(self.seeds))]
-            self.evaluating = Evaluating(*now, diagnosed, games)
-            return
-        for seed, values in zip(self.seeds, diagnosed, strict=True):
-            if values:
-                seed.report.eval_row(self.env_steps, self.updates, values)
+        self.fetch()
+        for seed, state in self.each(self.state):
+            seed.start_evaluation(state, self.env_steps, self.updates, self.now)
 
-    def diagnose(self, i: int) -> dict[str, Any]:
-        """What `srl_jax.diagnostics` says of a seed as it is now; writes what they keep of it."""
-        seed = self.seeds[i]
-        if seed.diagnostics is None:
-            return {}
-        self.check_losses()
-        state = self.device.part(self.state, i)
-        _, beta, hyper = self.now
-        values = seed.diagnostics.measure(state, self.env_steps, seed.replay, beta, hyper)
-        if self.env_steps in seed.diagnostics.steps:
-            parts = seed.diagnostics.parts(state.params)
-            seed.save_parameters(parts, self.env_steps, self.updates, folder="encoders", keep=0)
-        return values
-
-    def play(self, i: int, params: Params, env_steps: int) -> tuple:
-        """Plays the evaluation of a seed: the games, and seconds."""
-        began, seed = time.perf_counter(), self.seeds[i]
-        policy = greedy_policy(self.agent, self.device.part(params, i), named_key(seed.key, "eval"))
-        played = seed.evaluate(policy, env_steps, lambda: self.left)
-        return played, time.perf_counter() - began
-
-    def finish_evaluation(self) -> None:
-        """Waits for the evaluation that is under way and writes its rows; keeps the best parameters.
+    def finish_evaluation(self) -> bool:
+        """Waits for the evaluation that is under way, if one is, and writes its rows.
 
         Called before the next row is written, so that rows are in the same order however long games take.
+
+        Returns:
+            Whether all seeds have reached the return that ends the run.
         """
-        if self.evaluating is None:
-            return
-        (params, env_steps, updates, diagnosed, games), self.evaluating = self.evaluating, None
+        means = [seed.finish_evaluation(self.env_steps) for seed in self.seeds]
         wanted = self.config.stop_at_return
-        for i, seed in enumerate(self.seeds):
-            played, seconds = games[i].result()
-            seed.recording = played.frames
-            mean = seed.report.evaluation(env_steps, updates, played, seconds, diagnosed[i])
-            seed.report.progress.update(self.env_steps, evaluation=mean)
-            seed.solved = wanted is not None and mean >= wanted
-            if mean > seed.best:
-                seed.best = mean
-                if self.config.keep_best:
-                    own = self.device.part(params, i)
-                    seed.save_parameters(own, env_steps, updates, folder="best", keep=1)
+        return wanted is not None and min(means) >= wanted
 
-    # Checkpoints
-
-    @property
-    def is_saved(self) -> bool:
-        """Whether there are checkpoints of this moment that can be resumed from."""
+    def save(self) -> None:
+        """Writes checkpoints that can be resumed from, unless there are some of this moment."""
         saved = self.seeds[0].saved
-        return saved is not None and saved.env_steps == self.env_steps
-
-    def save(self, evaluation_due: bool = False) -> None:
-        """Writes checkpoints that can be resumed from, unless there are some of this moment.
-
-        Args:
-            evaluation_due: whether an evaluation of this moment comes next.
-        """
-        if self.is_saved:
-            return
-        self.finish_evaluation()
-        self.check_losses()
-        for i, seed in enumerate(self.seeds):
-            seed.evaluation_due = evaluation_due
-            seed.save(self.device.part(self.state, i), self.env_steps, self.updates)
+        if saved is None or saved.env_steps != self.env_steps:
+            self.fetch()
+            for seed, state in self.each(self.state):
+                seed.save(state, self.env_steps, self.updates)
 
     def keep_encoders(self) -> None:
         """Writes the encoders, if the checkpoint that is due is one of every `keep_encoder_every`."""
         every = self.config.keep_encoder_every
         if every and self.env_steps // self.checkpoint_every % every == 0:
-            self.check_losses()
-            for i, seed in enumerate(self.seeds):
-                if seed.diagnostics is None or self.env_steps not in seed.diagnostics.steps:  # they keep it
-                    encoder = {"encoder": self.device.part(self.state.params, i)["encoder"]}
-                    seed.save_parameters(encoder, self.env_steps, self.updates, folder="encoders", keep=0)
+            self.fetch()
+            for seed, params in self.each(self.state.params):
+                seed.keep({"encoder": params["encoder"]}, self.env_steps, self.updates)
 
     def finish(self) -> None:
         """Writes the last checkpoints, without `keep_replay` of parameters alone, and slims those before."""
-        self.check_losses()
         if self.config.keep_replay:
             return self.save()
-        for i, seed in enumerate(self.seeds):
-            seed.save_parameters(self.device.part(self.state.params, i), self.env_steps, self.updates)
+        self.fetch()
+        for seed, params in self.each(self.state.params):
+            seed.save_parameters(params, self.env_steps, self.updates)
         for seed in self.seeds:  # until all have theirs, they can be resumed from the ones before
             if seed.saved is not None and seed.saved.env_steps < self.env_steps:
                 checkpoint.slim(seed.saved)

@@ -1,4 +1,4 @@
-"""A run's numbers on disk: metrics.jsonl, and TensorBoard events beside it.
+"""A run's numbers on disk: metrics.jsonl. Imports no jax.
 
 Every key whose value depends on the clock begins with `wall_` (`wall_s`, `wall_steps_per_s`); every
 other value must be a function of the configuration and the seed. Two runs of the same seed on the
@@ -47,32 +47,13 @@ class MetricsWriter:
 
     Args:
         path: the file, made if it does not exist; its directory must exist.
-        tensorboard_dir: where to write TensorBoard events too, or None. Scalars only, under the
-            same keys, with env_steps as the step.
         mark: from `mark`, or None.
-        env_steps: of the mark; TensorBoard hides events from there on.
 
     Raises:
-        ImportError: if `tensorboard_dir` is given and tensorboardX is not installed.
         ConfigError: the file does not begin with what it held at the mark; it is as it was.
     """
 
-    def __init__(
-        self,
-        path: str | os.PathLike,
-        tensorboard_dir: str | os.PathLike | None = None,
-        mark: Mark | None = None,
-        env_steps: int = 0,
-    ):
-        self._events = None
-        if tensorboard_dir is not None:
-            try:
-                from tensorboardX import SummaryWriter
-            except ImportError as error:
-                raise ImportError(
-                    "TensorBoard events need tensorboardX: pip install srl-jax[tensorboard]"
-                ) from error
-            self._events = SummaryWriter(str(tensorboard_dir), purge_step=env_steps + 1 if mark else None)
+    def __init__(self, path: str | os.PathLike, mark: Mark | None = None):
         if mark is not None:
             _cut(Path(path), mark)
         _mend(Path(path))
@@ -81,7 +62,7 @@ class MetricsWriter:
 
     def write(
         self, kind: str, env_steps: int, updates: int, wall_s: float, values: Mapping[str, Any]
-    ) -> None:
+    ) -> dict[str, Any]:
         """Writes one row.
 
         Args:
@@ -92,6 +73,9 @@ class MetricsWriter:
             values: key -> a number, bool, string, None, or an array or sequence of those. Device
                 arrays are fetched here: this is where the host waits for them.
 
+        Returns:
+            The row, as `read_metrics` will read it.
+
         Raises:
             ValueError: for another kind, or a value under one of the leading keys.
             TypeError: for a value of another type.
@@ -100,23 +84,18 @@ class MetricsWriter:
             raise ValueError(f"kind is {kind!r}; valid: {', '.join(KINDS)}")
         if clash := sorted(set(values) & set(LEADING)):
             raise ValueError(f"values may not hold the leading keys {', '.join(clash)}")
-        rest = {key: _plain(key, values[key]) for key in sorted(values)}
         row = {
             "kind": kind,
             "env_steps": int(env_steps),
             "updates": int(updates),
             "wall_s": round(float(wall_s), 3),
-            **rest,
+            **{key: _plain(key, values[key]) for key in sorted(values)},
         }
         line = (json.dumps(row, allow_nan=False) + "\n").encode()
         self._file.write(line)
         self._file.flush()
         self._digest.update(line)
-        if self._events is not None:
-            for key, value in rest.items():
-                if isinstance(value, int | float):
-                    self._events.add_scalar(key, value, row["env_steps"])
-            self._events.flush()
+        return row
 
     def mark(self) -> Mark:
         """Where the file ends now, flushed to disk."""
@@ -124,11 +103,8 @@ class MetricsWriter:
         return Mark(self._file.tell(), self._digest.hexdigest())
 
     def close(self) -> None:
-        """Closes the files. A second call does nothing."""
+        """Closes the file. A second call does nothing."""
         self._file.close()
-        if self._events is not None:
-            self._events.close()
-            self._events = None
 
     def __enter__(self) -> "MetricsWriter":
         return self

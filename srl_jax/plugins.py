@@ -8,8 +8,8 @@ A file registers what it has when it is imported:
     def mine(context, *, weight: float = 1.0): ...
 
 `--import=my_file.py --objective=mine` imports it, and so does a module's name, `--import=my_package.losses`.
-An installed package names its rows as entry points of the groups `srl_jax.objectives`, `srl_jax.encoders` and
-`srl_jax.rl`; those are looked up where a name is in no registry.
+An installed package names its rows as entry points of the groups `srl_jax.objectives`, `srl_jax.encoders`,
+`srl_jax.rl` and `srl_jax.loggers`; those are looked up where a name is in no registry.
 """
 
 import functools
@@ -22,6 +22,7 @@ import traceback
 import zlib
 from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 from srl_jax.errors import ConfigError
@@ -98,11 +99,12 @@ class Registry(dict[str, Callable]):
         return bool(found)
 
 
-def located(text: str) -> str:
+def located(text: str, flag: str = "import") -> str:
     """What config.json keeps of a value of --import: a file's absolute path, or a module's name.
 
     Args:
         text: a path, which has a / or ends in .py; or the name of a file here, without .py; or a module's.
+        flag: that it came from.
 
     Raises:
         ConfigError: there is no such file, or it is no Python file.
@@ -112,37 +114,43 @@ def located(text: str) -> str:
         here = path.with_name(f"{path.name}.py")
         return str(here) if here.is_file() else text
     if path.suffix != ".py":
-        raise ConfigError(f"--import={text}: must be a file that ends in .py, or a module's name")
-    return str(_checked(str(path)))
+        raise ConfigError(f"--{flag}={text}: must be a file that ends in .py, or a module's name")
+    return str(_checked(str(path), flag))
 
 
 def load(imports: Iterable[str]) -> None:
-    """Imports files and modules, each once in a process.
+    """Imports files and modules; see `imported`."""
+    for text in imports:
+        imported(text)
+
+
+def imported(text: str, flag: str = "import") -> ModuleType:
+    """A file or a module, imported once in a process.
 
     Args:
-        imports: as `located` gives them.
+        text: as `located` gives it.
+        flag: that it came from.
 
     Raises:
-        ConfigError: one is missing, lies in a run directory, or raises an error; one line that names it.
+        ConfigError: it is missing, lies in a run directory, or raises an error; one line that names it.
     """
-    for text in imports:
-        if text not in _LOADED:
-            path = _checked(text) if _is_path(text) else None
-            try:
-                _import_file(path) if path else importlib.import_module(text)
-            except (Exception, SystemExit) as error:
-                raise ConfigError(f"--import={text}: {_reason(error, path)}") from error
-            _LOADED.add(text)
+    if text not in _LOADED:
+        path = _checked(text, flag) if _is_path(text) else None
+        try:
+            _LOADED[text] = _import_file(path) if path else importlib.import_module(text)
+        except (Exception, SystemExit) as error:
+            raise ConfigError(f"--{flag}={text}: {_reason(error, path)}") from error
+    return _LOADED[text]
 
 
-_LOADED: set[str] = set()
+_LOADED: dict[str, ModuleType] = {}
 
 
 def _is_path(text: str) -> bool:
     return "/" in text or os.sep in text or text.endswith(".py")
 
 
-def _checked(text: str) -> Path:
+def _checked(text: str, flag: str) -> Path:
     """The path of a file that may be imported.
 
     Raises:
@@ -150,16 +158,16 @@ def _checked(text: str) -> Path:
     """
     path = Path(text)
     if not path.is_file():
-        raise ConfigError(f"--import={text}: no such file; --import=PATH says where it lies now")
+        raise ConfigError(f"--{flag}={text}: no such file; --{flag}=PATH says where it lies now")
     for folder in path.resolve().parents:
         if (folder / "config.json").exists() and (folder / "metrics.jsonl").exists():
             raise ConfigError(
-                f"--import={text}: lies in a run directory, {folder}, from which nothing is imported; copy it"
+                f"--{flag}={text}: lies in a run directory, {folder}, from which nothing is imported; copy it"
             )
     return path
 
 
-def _import_file(path: Path) -> None:
+def _import_file(path: Path) -> ModuleType:
     # By a name that no other module has; what lies beside the file it may import.
     name = f"srl_jax_import_{path.stem}_{zlib.crc32(os.fsencode(path)):08x}"
     spec = importlib.util.spec_from_file_location(name, path)
@@ -174,6 +182,7 @@ def _import_file(path: Path) -> None:
     except BaseException:
         del sys.modules[name]
         raise
+    return module
 
 
 def _reason(error: BaseException, path: Path | None = None) -> str:

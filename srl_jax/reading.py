@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from srl_jax.errors import ConfigError
+
 SETTINGS = 1 << 24
 """Bytes that a config.json may have."""
 ROWS = 1 << 30
@@ -36,6 +38,24 @@ def read_bytes(path: str | os.PathLike, limit: int = sys.maxsize) -> bytes:
     if about.st_size > limit:
         raise OSError(errno.EFBIG, f"File larger than {limit} bytes", path)
     return Path(path).read_bytes()
+
+
+def read_json(path: str | os.PathLike, limit: int = SETTINGS) -> Any:
+    """What a JSON file holds.
+
+    Args:
+        path: of the file.
+        limit: the bytes that it may have.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not JSON as `parse_json` reads it; one line that names it.
+    """
+    try:
+        return parse_json(read_bytes(path, limit))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except ValueError as error:
+        raise ConfigError(f"{path}: not JSON: {error}") from None
 
 
 def replace_text(path: Path, text: str) -> None:

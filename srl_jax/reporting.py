@@ -1,6 +1,7 @@
-"""Reports of a run: rows of metrics.jsonl, the progress bar, and the means between two rows."""
+"""Reports of a run: rows of metrics.jsonl and of loggers, progress, and the means between two rows."""
 
 import contextlib
+import json
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -8,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from srl_jax.display import Display
+from srl_jax import display
+from srl_jax.config import Config
+from srl_jax.display import Display, Progress
 from srl_jax.errors import saving
 from srl_jax.evaluate import Evaluation
-from srl_jax.metrics import Mark, MetricsWriter
-from srl_jax.progress import Progress
+from srl_jax.loggers import Loggers
+from srl_jax.metrics import Mark, MetricsWriter, read_metrics
 
 SOMETIMES = ("grad_norm/", "step_ratio/")
 """How the names of metrics begin that only some updates measure; see `srl_jax.optim.NOT_MEASURED`."""
@@ -55,36 +58,48 @@ class Means:
 
 
 class Report:
-    """metrics.jsonl, TensorBoard and progress of one run; a context in which they are open.
+    """metrics.jsonl, loggers and progress of one run; a context in which they are open.
 
     Args:
         out: the run directory.
-        total: env steps of the whole run.
+        config: of the run.
         progress: whether to draw a progress bar on stderr.
-        tensorboard: whether to write its events.
     """
 
-    def __init__(self, out: Path, total: int, *, progress: bool, tensorboard: bool):
+    def __init__(self, out: Path, config: Config, *, progress: bool):
         self.path = Path(out or ".") / "metrics.jsonl"
-        self._events = self.path.parent / "tensorboard" if tensorboard else None
-        self.progress = Progress(total, stream=None if progress else Display(None))
+        self._config = config
+        self.progress = Progress(config.steps, stream=None if progress else Display(None))
+        self._say = self.progress.note if progress else display.say
         self.means = Means()
         self._started = time.perf_counter()
         self._return_sum, self._episodes = 0.0, 0  # of training episodes that ended since the last row
         self._last_row = 0.0, 0  # seconds, env steps
         self._mark: Mark | None = None
-        self._begun = 0
 
     def __enter__(self) -> "Report":
-        self._writer = MetricsWriter(self.path, self._events, self._mark, self._begun)
-        self.progress.__enter__()
+        """Opens them.
+
+        Raises:
+            ConfigError: a logger cannot be made, or metrics.jsonl is not what a checkpoint knows.
+        """
+        texts, config = self._config.loggers, json.loads(self._config.to_json())
+        resumed = self._mark is not None
+        with contextlib.ExitStack() as stack:
+            # First: what refuses a run that begins leaves nothing there.
+            self._loggers = Loggers(texts, self.path.parent, config, self._say, resumed=resumed)
+            stack.callback(self._loggers.close)
+            self._writer = stack.enter_context(MetricsWriter(self.path, self._mark))
+            if texts:
+                self._loggers.rows(read_metrics(self.path))
+            self._opened = stack.pop_all()
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, trace: Any) -> None:
-        self.progress.__exit__(kind, error, trace)
+        self.progress.close()
         # After an error a row was not written, or worse, and the caller is told that.
         with saving(self.path, "not closed") if error is None else contextlib.suppress(OSError):
-            self._writer.close()
+            self._opened.close()
 
     @property
     def seconds(self) -> float:
@@ -137,9 +152,22 @@ class Report:
         self.progress.note(f"evaluation after {env_steps} env steps: mean return {mean:.2f} over {games}")
         return mean
 
+    def pictures(self, env_steps: int, drawn: Mapping[str, tuple[np.ndarray, ...]]) -> None:
+        """Gives loggers a picture for each objective: a row of examples for each of its arrays.
+
+        Args:
+            env_steps: of now.
+            drawn: {objective: (inputs, targets, outputs)}, float [B, H, W, C] each, 1 white.
+        """
+        for name, arrays in drawn.items() if self._config.loggers else ():
+            picture = np.concatenate([np.concatenate(list(images), 1) for images in arrays])
+            picture = np.rint(picture.clip(0, 1) * 255).astype(np.uint8)
+            self._loggers.picture(f"pictures/{name}", env_steps, picture)
+
     def _write(self, kind: str, env_steps: int, updates: int, seconds: float, values: Mapping) -> None:
         with saving(self.path, "a row was not written"):
-            self._writer.write(kind, env_steps, updates, seconds, values)
+            row = self._writer.write(kind, env_steps, updates, seconds, values)
+        self._loggers.rows([row])
 
     def snapshot(self) -> dict[str, Any]:
         """As JSON values; rows written so far are flushed to disk."""
@@ -153,14 +181,9 @@ class Report:
             "means": self.means.snapshot(),
         }
 
-    def restore(self, snapshot: Mapping[str, Any], env_steps: int) -> None:
-        """Goes on from there; before the report is entered, which cuts metrics.jsonl back.
-
-        Args:
-            snapshot: from `snapshot`, by way of JSON.
-            env_steps: when it was taken.
-        """
-        self._mark, self._begun = Mark(**snapshot["metrics"]), env_steps
+    def restore(self, snapshot: Mapping[str, Any]) -> None:
+        """Goes on from there, by way of JSON; before the report is entered, which cuts metrics.jsonl back."""
+        self._mark = Mark(**snapshot["metrics"])
         self._started = time.perf_counter() - snapshot["seconds"]
         self._last_row = tuple(snapshot["last_row"])
         self._return_sum, self._episodes = snapshot["returns"]

@@ -1,7 +1,9 @@
 """What one seed of a run has on the host: environments, replay, rows, and the files that they go to."""
 
-import functools
+import contextlib
+import time
 from collections.abc import Callable, Mapping
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,39 +11,38 @@ import jax
 import numpy as np
 
 from srl_jax import checkpoint
-from srl_jax.actor import FrameStack, Policy, make_env, random_policy, seed_for
+from srl_jax.actor import FrameStack, Policy, make_env, random_policy, seed_for, yielding_threads
 from srl_jax.agent import Agent
 from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config
-from srl_jax.diagnostics.measure import Diagnostics
+from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
 from srl_jax.evaluate import Evaluation, evaluate
+from srl_jax.loading import greedy_policy
 from srl_jax.optim import real_copy
 from srl_jax.replay import Replay, fitting
 from srl_jax.reporting import Report
+from srl_jax.schedules import Now
 from srl_jax.types import Params, TrainState
+from srl_jax.update import named_key
 
 RECORDED = 501
 """Frames of the last evaluation that are kept: of 500 env steps."""
 
 
-class Step(NamedTuple):
-    """One step of N environments.
+class Evaluating(NamedTuple):
+    """An evaluation that is under way.
 
     Attributes:
-        actions: int32 [N].
-        frames, rewards, terminated, truncated: what `env.step` returned.
-        life_lost: bool [N].
-        begun: the frames after those games that ended were reset; None where none ended.
+        params: of the policy.
+        env_steps, updates: when these were the run's.
+        values: what the diagnostics of that moment say.
     """
 
-    actions: np.ndarray
-    frames: np.ndarray
-    rewards: np.ndarray
-    terminated: np.ndarray
-    truncated: np.ndarray
-    life_lost: np.ndarray
-    begun: np.ndarray | None
+    params: Params
+    env_steps: int
+    updates: int
+    values: dict[str, Any]
 
 
 class Seed:
@@ -49,9 +50,8 @@ class Seed:
 
     Attributes:
         best: the largest mean return of an evaluation so far.
-        solved: whether the last evaluation reached the return that ends the run.
+        evaluating: the evaluation that is under way; its games are played in a thread.
         saved: the newest checkpoint that can be resumed from; None before there is one.
-        evaluation_due: whether that checkpoint was written before an evaluation of the same moment.
 
     Args:
         config: of this seed.
@@ -88,14 +88,17 @@ class Seed:
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
         self.rng = np.random.default_rng(seed_for(config.seed, "random policy"))
         self.policy: Policy = random_policy(int(env.single_action_space.n), self.rng)  # without RL
-        self.report = Report(out, config.steps, progress=progress, tensorboard=config.tensorboard)
+        self.report = Report(out, config, progress=progress)
         self.diagnostics: Diagnostics | None = None
         if config.diagnostics:
             say = self.report.progress.note
             self.diagnostics = Diagnostics(config, agent.measures, agent.horizon, out, say)
         self.recording: np.ndarray | None = None  # uint8 [T, H, W, C], the first games of the last evaluation
         self.best = -np.inf
-        self.solved = self.evaluation_due = False
+        self.evaluating: Evaluating | None = None
+        self.games: Future[tuple[Evaluation, float]] | None = None  # of that evaluation, and seconds
+        self.eval_thread = yielding_threads("evaluation", 1)
+        self.eval_env: Any = None  # made when there is something to play
         self.saved: Manifest | None = None
         self.saved_position = self.replay.next_position.copy()  # replay's, when it was written
 
@@ -105,57 +108,104 @@ class Seed:
         self.stacks.begin(frames)
         self.replay.begin(frames)
 
-    def step_env(self, actions: np.ndarray) -> Step:
-        """Takes a step of the environments and resets those whose game ended; touches nothing else."""
+    def step_env(self, actions: np.ndarray) -> tuple[tuple, np.ndarray, np.ndarray | None]:
+        """Takes a step of the environments and resets those whose game ended; touches nothing else.
+
+        Returns:
+            The arguments of `Replay.add`, the raw rewards, and the frames after those games that ended were
+            reset; None where none ended.
+        """
         frames, rewards, terminated, truncated, info = self.env.step(actions)
+        learnt = np.sign(rewards) if self.config.reward_clip else rewards
+        lost = info["life_lost"] if self.config.life_loss else np.zeros(len(actions), bool)
         over, begun = terminated | truncated, None
         if over.any():
             begun, _ = self.env.reset(options={"reset_mask": over})
-        return Step(actions, frames, rewards, terminated, truncated, info["life_lost"], begun)
+        return (actions, learnt.astype(np.float32), terminated, truncated, lost, frames), rewards, begun
 
-    def take(self, step: Step) -> None:
-        """Adds a step to replay, to the stacks of frames and to the scores."""
-        config, over = self.config, step.terminated | step.truncated
-        self.score += step.rewards
-        self.stacks.push(step.frames)
-        self.replay.add(
-            step.actions,
-            (np.sign(step.rewards) if config.reward_clip else step.rewards).astype(np.float32),
-            step.terminated,
-            step.truncated,
-            step.life_lost if config.life_loss else np.zeros(config.num_envs, bool),
-            step.frames,
-        )
-        if step.begun is not None:
+    def take(self, step: tuple, rewards: np.ndarray, begun: np.ndarray | None) -> None:
+        """Adds what `step_env` gave to replay, to the stacks of frames and to the scores."""
+        _, _, terminated, truncated, _, frames = step
+        self.replay.add(*step)
+        self.score += rewards
+        self.stacks.push(frames)
+        if begun is not None:
+            over = terminated | truncated
             self.report.ended(self.score[over])
             self.score[over] = 0.0
-            self.stacks.begin(step.begun, over)
-            self.replay.begin(step.begun[over], np.flatnonzero(over))
+            self.stacks.begin(begun, over)
+            self.replay.begin(begun[over], np.flatnonzero(over))
 
-    @functools.cached_property
-    def eval_env(self) -> Any:
-        """The environments of evaluations, made when there is something to play."""
-        return make_env(self.config, "eval", min(self.config.num_envs, self.config.eval_games))
+    def start_evaluation(self, state: TrainState, env_steps: int, updates: int, now: Now) -> None:
+        """Measures the latent of now, and has the policy of now play while training goes on."""
+        values: dict[str, Any] = {}
+        if self.diagnostics is not None:
+            values = self.diagnostics.measure(state, env_steps, self.replay, now.beta, now.hyper)
+            if env_steps in self.diagnostics.steps:
+                self.keep(self.diagnostics.parts(state.params), env_steps, updates)
+        if self.agent.mode.rl:
+            self.evaluating = Evaluating(state.params, env_steps, updates, values)
+            self.play()
+        elif values:
+            self.report.eval_row(env_steps, updates, values)
 
-    def evaluate(self, policy: Policy, env_steps: int, stop: Callable[[], bool]) -> Evaluation | None:
-        """Plays the evaluation of an env step; None once `stop` says so."""
-        config = self.config
-        return evaluate(
-            policy,
+    def play(self) -> None:
+        """Begins with the games of the evaluation under way, if there is one, in a thread of their own."""
+        if self.evaluating:
+            self.games = self.eval_thread.submit(self._played, self.evaluating)
+
+    def _played(self, evaluating: Evaluating) -> tuple[Any, float]:
+        """The games, and seconds."""
+        began, config = time.perf_counter(), self.config
+        if self.eval_env is None:
+            self.eval_env = make_env(config, "eval", min(config.num_envs, config.eval_games))
+        played = evaluate(
+            greedy_policy(self.agent, evaluating.params, named_key(self.key, "eval")),
             self.eval_env,
             games=config.eval_games,
-            seed=seed_for(config.seed, "eval", env_steps),
+            seed=seed_for(config.seed, "eval", evaluating.env_steps),
             epsilon=config.eps_eval,
             stack=config.frame_stack,
             max_steps=config.eval_max_steps,
             record=RECORDED,
-            stop=stop,
+            stop=lambda: self.evaluating is None,
         )
+        return played, time.perf_counter() - began
+
+    def finish_evaluation(self, env_steps: int) -> float:
+        """Waits for the evaluation under way and writes its row; keeps the best parameters.
+
+        Args:
+            env_steps: of now, where the progress bar stands.
+
+        Returns:
+            Its mean return; -inf where none is under way.
+        """
+        if self.evaluating is None or self.games is None:
+            return -np.inf
+        played, seconds = self.games.result()
+        (params, then, updates, values), self.evaluating = self.evaluating, None
+        self.recording = played.frames
+        mean = self.report.evaluation(then, updates, played, seconds, values)
+        self.report.progress.update(env_steps, evaluation=mean)
+        if mean > self.best:
+            self.best = mean
+            if self.config.keep_best:
+                self.save_parameters(params, then, updates, folder="best", keep=1)
+        return mean
+
+    def open(self, stack: contextlib.ExitStack) -> None:
+        """Opens rows and threads in a context, which closes them and the environments."""
+        stack.callback(self.close)
+        stack.enter_context(self.report)
+        stack.enter_context(self.eval_thread)
+        stack.callback(setattr, self, "evaluating", None)  # nobody waits for its games any more
 
     def close(self) -> None:
         """Closes the environments."""
-        for env in {"env", "eval_env"} & vars(self).keys():
-            vars(self)[env].close()
+        for env in (self.env, self.eval_env):
+            if env is not None:
+                env.close()
 
     def parts(self, env_steps: int) -> dict[str, tuple[Callable, Callable]]:
         """{name: (snapshot, restore)} of all that changes on the host; `env_steps` is of now.
@@ -166,26 +216,24 @@ class Seed:
             "replay": (self.replay.snapshot, self.replay.restore),
             "env": (lambda: (self.env.snapshot(), None), lambda arrays, _: self.env.restore(arrays)),
             "play": (self._snapshot, self._restore),
-            "report": (lambda: ({}, self.report.snapshot()), lambda _, x: self.report.restore(x, env_steps)),
+            "report": (lambda: ({}, self.report.snapshot()), lambda _, x: self.report.restore(x)),
         }
 
     def _snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         recording = {} if self.recording is None else {"recording": self.recording}
-        numbers = {name: getattr(self, name) for name in ("solved", "evaluation_due")}
-        numbers["best"] = self.best if np.isfinite(self.best) else None
-        numbers["rng"] = self.rng.bit_generator.state
+        numbers = {
+            "best": self.best if np.isfinite(self.best) else None,
+            "evaluating": self.evaluating and self.evaluating[1:],
+            "rng": self.rng.bit_generator.state,
+        }
         return {"stacks": self.stacks.frames, "score": self.score, **recording}, numbers
 
     def _restore(self, arrays: Mapping[str, np.ndarray], numbers: Mapping[str, Any]) -> None:
-        for name, own in (("stacks", self.stacks.frames), ("score", self.score)):
-            found = fitting(arrays, name, own)
-            if not np.isfinite(found).all():
-                raise ValueError(f"snapshot: {name} is not finite")
-            own[:] = found
+        self.stacks.frames[:] = fitting(arrays, "stacks", self.stacks.frames)
+        self.score[:] = fitting(arrays, "score", self.score)
         self.recording = arrays["recording"] if "recording" in arrays else None
-        self.rng.bit_generator.state = numbers["rng"]
         self.best = -np.inf if numbers["best"] is None else float(numbers["best"])
-        self.solved, self.evaluation_due = bool(numbers["solved"]), bool(numbers["evaluation_due"])
+        self.rng.bit_generator.state = numbers["rng"]
 
     def save(self, state: TrainState, env_steps: int, updates: int) -> None:
         """Writes a checkpoint that can be resumed from."""
@@ -202,7 +250,14 @@ class Seed:
             arrays |= {f"{part}_{name}": x for name, x in found.items()}
         unchanged = self.replay.unchanged_chunks(self.saved_position) if self.saved else ()
         names = frozenset(f"replay_{name}" for name in unchanged)
-        return checkpoint.State({"learner": _learner(state)}, arrays, numbers, names)
+        trees = {"learner": _learner(state)}
+        if self.evaluating and self.evaluating.env_steps != env_steps:
+            trees["evaluating"] = self.evaluating.params
+        return checkpoint.State(trees, arrays, numbers, names)
+
+    def keep(self, params: Params, env_steps: int, updates: int) -> None:
+        """Writes parameters into `encoders/`, where they stay."""
+        self.save_parameters(params, env_steps, updates, folder="encoders", keep=0)
 
     def save_parameters(self, params: Params, env_steps: int, updates: int, **options: Any) -> Manifest:
         """Writes a checkpoint, without options of parameters alone; see `srl_jax.checkpoint.save`."""
@@ -235,13 +290,16 @@ class Seed:
             numbers = checkpoint.load_numbers(manifest)
             for part, (_, restore) in self.parts(manifest.env_steps).items():
                 restore(checkpoint.Arrays(manifest, f"{part}_"), numbers[part])
+            if evaluating := numbers["play"]["evaluating"]:
+                played = params
+                if evaluating[0] != manifest.env_steps:
+                    tree = checkpoint.load_tree(manifest, "evaluating")
+                    played = checkpoint.load_into(shapes.params, tree, where)
+                self.evaluating = Evaluating(real_copy(played), *evaluating)
+        except ConfigError:
+            raise
         except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
-            if isinstance(error, ConfigError):
-                raise
-            reason = f"{type(error).__name__}: {error}"
-            raise ConfigError(f"{where}: cannot be resumed from: {reason}") from None
-        if manifest.config.stop_at_return != self.config.stop_at_return:
-            self.solved = False
+            raise ConfigError(f"{where}: cannot be resumed from: {type(error).__name__}: {error}") from None
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         key = jax.random.wrap_key_data(learner.pop("key"))
         return real_copy(shapes._replace(params=params, key=key, **learner))

@@ -281,14 +281,14 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
                 f"{where}: {name} has no option {key!r}; {suggestion}options and defaults: {known}"
             )
         default = defaults[key]
+        hint = f" (default {value_text(default)})"
         try:
             options[key] = parse_value(value, type(default))
         except ValueError as error:
-            raise SpecError(f"{where}: {key}={value} is {error} (default {value_text(default)})") from None
-        is_number = type(default) in (int, float)
-        if is_number and options[key] < 0 <= default:
-            raise SpecError(f"{where}: {key}={value} must not be negative (default {value_text(default)})")
-        if is_number:
+            raise SpecError(f"{where}: {key}={value} is {error}{hint}") from None
+        if type(default) in (int, float):
+            if options[key] < 0 <= default:
+                raise SpecError(f"{where}: {key}={value} must not be negative{hint}")
             try:
                 Info(type(default), "").check(options[key])
             except ValueError as error:

@@ -8,7 +8,6 @@ from srl_jax import checkpoint, envs, modes, plugins
 from srl_jax.config import Config, resolve
 from srl_jax.errors import ConfigError
 from srl_jax.rundir import run_directory
-from srl_jax.specs import build, parse
 
 if TYPE_CHECKING:
     from srl_jax.loop import Result
@@ -43,7 +42,7 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
     modes.check(config)
     check_game(config)
     full = resolved(config)
-    checkpoint.check_sources(full)
+    check_sources(full)
 
     from srl_jax import loop
 
@@ -74,23 +73,48 @@ def resolved(config: Config) -> Config:
 
     Raises:
         ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
-            these frames.
+            these frames, or a logger's package is missing.
     """
-    from srl_jax import encoders, objectives, rl
-    from srl_jax.types import Context
+    from srl_jax import encoders, loggers, objectives, rl
+    from srl_jax.agent import components
 
     if config.imports:
         plugins.load(config.imports)
         check_game(config, imported=True)
+    loggers.check(config.loggers)
     full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
-    # Options may be valid one by one and not together, or not for these frames: only a factory
-    # knows. The number of actions is not known yet; any will do for that.
-    size = config.frame_size or 84  # an environment's own is known once it is made
-    shape = (size, size, config.frame_stack)
-    encoder = build(parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
-    context = Context.of(encoder, num_actions=18)
-    build(parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
-    for text in config.objectives:
-        objective = parse(text, objectives.REGISTRY, "objective")
-        build(objective, objectives.REGISTRY, context)
+    # Options may be valid one by one and not together, or not for these frames: only a factory knows. An
+    # environment's own size and its number of actions are known once it is made; any will do for that.
+    size = config.frame_size or 84
+    components(config, (size, size, 1), num_actions=18)
     return full
+
+
+_SAME = {"encoder_from": "encoder", "policy_from": "game"}
+"""What a run must have in common with the one that a flag names, beside how frames are made."""
+
+
+def check_sources(config: Config) -> None:
+    """Whether the checkpoints that a run wants to start from exist and fit it; reads manifests alone.
+
+    Raises:
+        ConfigError: one line that names the flag and what differs.
+    """
+    for flag, own in _SAME.items():
+        if not (path := getattr(config, flag)):
+            continue
+        try:
+            found = checkpoint.read_manifest(path).config
+        except ConfigError as error:
+            raise ConfigError(f"--{flag}={path}: {error}") from None
+        if flag == "policy_from" and found.mode == "pretrain":
+            raise ConfigError(
+                f"--{flag}={path}: a representation run has no policy; name a run of another mode"
+            )
+        for field in (own, "frame_size", "frame_stack"):
+            what = {"encoder": "architecture", "game": "game"}.get(field, "preprocessing")
+            ours, theirs = getattr(config, field), getattr(found, field)
+            if ours != theirs:
+                raise ConfigError(
+                    f"--{flag}={path}: the {what} differs: {field} is {theirs} there and {ours} here"
+                )

@@ -66,6 +66,8 @@ class Encoder(NamedTuple):
             more numbers (a one-hot action, say). None where there is no decoder.
         map_shape: (H', W', C'), the last convolution's map of one observation before it is flattened; None
             where there is none, or it is not known.
+        steps: what `apply` computes, step by step, for a program without this one, see
+            `srl_jax.encoders.files.to_npz`; None where nothing says it.
     """
 
     init: Callable[[jax.Array], Params]
@@ -74,6 +76,7 @@ class Encoder(NamedTuple):
     observation_shape: tuple[int, ...]
     make_decoder: MakeDecoder | None
     map_shape: tuple[int, ...] | None = None
+    steps: Sequence[Mapping[str, Any]] | None = None
 
 
 class Decoder(NamedTuple):

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
+from jax.typing import ArrayLike
 
 from srl_jax.augment import random_shift
 from srl_jax.modes import ENCODER_OPTIMIZERS, Mode
@@ -90,21 +91,82 @@ def make_follow(objectives: Mapping[str, Objective]) -> Callable:
     return follow_all
 
 
+class Pass(NamedTuple):
+    """One gradient and one optimizer step of an update.
+
+    Attributes:
+        objectives: names of the losses whose weighted sum is differentiated.
+        groups: {group of parameters that moves: group of the optimizer's state that moves it}.
+        at_start: whether the gradient is taken at the parameters from before the update, and not at those
+            that the pass before has left.
+    """
+
+    objectives: tuple[str, ...]
+    groups: dict[str, str]
+    at_start: bool = False
+
+
+def passes(mode: Mode, active: Collection[str], encoder_optimizer: str = "separate") -> tuple[Pass, ...]:
+    """The passes of an update that computes these objectives in this mode, in their order.
+
+    One, of the sum of all losses, unless both kinds of loss train the encoder.
+
+    Args:
+        mode: a row of `srl_jax.modes`.
+        active: names of the objectives; RL's is "rl".
+        encoder_optimizer: how both kinds of loss step the encoder. "separate": RL's Adam steps, then the
+            representation's own Adam steps on the same batch, encoded anew by the encoder that RL's step
+            left, as in the thesis' code. Adam does not see the scale of a loss, so the two steps are about as
+            long whatever the losses' weights. "simultaneous": likewise, but both gradients are taken at the
+            same parameters. "summed": one Adam on the gradient of the sum.
+
+    Raises:
+        ValueError: an objective has the name of one of the encoder's groups, or there is no such
+            `encoder_optimizer`.
+    """
+    if encoder_optimizer not in ENCODER_OPTIMIZERS:
+        valid = ", ".join(ENCODER_OPTIMIZERS)
+        raise ValueError(f"encoder_optimizer must be one of {valid}, not {encoder_optimizer}")
+    for name in (ENCODER, ENCODER_SRL):
+        if name in active:
+            raise ValueError(f"an objective cannot be called {name}: that is a group of the encoder's")
+
+    def one(names: tuple[str, ...], moments: str) -> Pass:
+        moves = mode.rl_trains_encoder and RL in names
+        moves |= mode.representation_trains_encoder and any(name != RL for name in names)
+        groups = {name: name for name in names} | ({ENCODER: moments} if moves else {})
+        return Pass(names, groups, at_start=encoder_optimizer == "simultaneous")
+
+    both = mode.rl_trains_encoder and mode.representation_trains_encoder and RL in active
+    others = tuple(name for name in active if name != RL)
+    if encoder_optimizer == "summed" or not both or not others:
+        return (one(tuple(active), ENCODER),)
+    return one((RL,), ENCODER), one(others, ENCODER_SRL)
+
+
 def make_init(
     encoder: Encoder,
     objectives: Mapping[str, Objective],
     mode: Mode,
     optimizer: Optimizer,
     *,
+    plan: Sequence[Pass] | None = None,
     target_encoder: str = "slow",
-    encoder_optimizer: str = "separate",
 ) -> Callable:
     """init: (key, given | None) -> TrainState.
 
-    An objective with a rule has a slow copy of its head and one of the encoder, unless `target_encoder` is
-    "online". `given`, {group: tree}, is where some groups of the parameters start. Each other tree's initial
-    values depend on the key and its own name alone.
+    `given`, {group: tree}, is where some groups of the parameters start. Each other tree's initial values
+    depend on the key and its own name alone.
+
+    Args:
+        encoder, objectives, mode, optimizer, plan: see `make_update`.
+        target_encoder: "slow": an objective with a rule has a slow copy of its head and one of the encoder,
+            which gives the slow latents; "online": of its head alone, and the slow latents are the online
+            encoder's without gradient, as in the thesis' code.
     """
+    if target_encoder not in ("slow", "online"):
+        raise ValueError(f"target_encoder must be slow or online, not {target_encoder}")
+    plan = passes(mode, objectives) if plan is None else plan
 
     def init(key: jax.Array, given: Params | None = None) -> TrainState:
         start = named_key(key, "init")
@@ -115,7 +177,7 @@ def make_init(
         params |= real_copy(given)
         lagged = params[ENCODER] if target_encoder == "slow" else {}
         slow = {n: {"encoder": lagged, "head": params[n]} for n, o in objectives.items() if o.slow}
-        groups = [pair for p in passes(mode, objectives, encoder_optimizer) for pair in p.groups.items()]
+        groups = [pair for one in plan for pair in one.groups.items()]
         return TrainState(
             params=params,
             slow=real_copy(slow),
@@ -127,79 +189,31 @@ def make_init(
     return init
 
 
-class Pass(NamedTuple):
-    """One gradient and one optimizer step of an update.
-
-    Attributes:
-        objectives: names of the losses whose weighted sum is differentiated.
-        groups: {group of parameters that moves: group of the optimizer's state that moves it}.
-    """
-
-    objectives: tuple[str, ...]
-    groups: dict[str, str]
-
-
-def passes(mode: Mode, active: Collection[str], encoder_optimizer: str) -> tuple[Pass, ...]:
-    """The passes of an update that computes these objectives in this mode, in their order.
-
-    One, of the sum of all losses; but where both kinds of loss train the encoder and `encoder_optimizer` is
-    not "summed", RL's and then the representation's, each with an Adam of its own.
-
-    Raises:
-        ValueError: an objective has the name of one of the encoder's groups.
-    """
-    for name in (ENCODER, ENCODER_SRL):
-        if name in active:
-            raise ValueError(f"an objective cannot be called {name}: that is a group of the encoder's")
-
-    def one(names: tuple[str, ...], moments: str) -> Pass:
-        moves = mode.rl_trains_encoder and RL in names
-        moves |= mode.representation_trains_encoder and any(name != RL for name in names)
-        return Pass(names, {name: name for name in names} | ({ENCODER: moments} if moves else {}))
-
-    both = mode.rl_trains_encoder and mode.representation_trains_encoder and RL in active
-    others = tuple(name for name in active if name != RL)
-    if encoder_optimizer == "summed" or not both or not others:
-        return (one(tuple(active), ENCODER),)
-    return one((RL,), ENCODER), one(others, ENCODER_SRL)
-
-
 def make_update(
     encoder: Encoder,
     objectives: Mapping[str, Objective],
     mode: Mode,
     optimizer: Optimizer,
     *,
+    plan: Sequence[Pass] | None = None,
     augment: str = "none",
-    target_encoder: str = "slow",
-    encoder_optimizer: str = "separate",
-    only: Collection[str] | None = None,
     slow_follows: bool = True,
 ) -> Callable:
     """update: (TrainState, Window, Hyper) -> (TrainState, td_error [B] | None, metrics), pure; jit it once.
 
-    In each of its `passes` it sums `weight * mean(losses)` over the pass' objectives, RL among them under
-    the name "rl", takes one gradient and one optimizer step. Objectives of a pass share the encoder's
-    forward and backward pass: an offset is encoded at most once for each view. Whether an objective's
-    gradient enters the encoder is the mode's to say, and is decided at the latent, so that nothing is
-    differentiated for nothing.
+    In each pass it sums `weight * mean(losses)` over the pass' objectives, RL among them under the name
+    "rl", takes one gradient and one optimizer step. Objectives of a pass share the encoder's forward and
+    backward pass: an offset is encoded at most once for each view. Whether an objective's gradient enters the
+    encoder is the mode's to say, and is decided at the latent, so that nothing is differentiated for nothing.
 
     Args:
         encoder: the shared encoder.
         objectives: by name; RL's is called "rl".
         mode: a row of `srl_jax.modes`.
         optimizer: from `srl_jax.optim`.
+        plan: the passes, see `passes`; None for those of all objectives. The heads of others do not move.
         augment: "none"; "srl": the representation losses see a randomly shifted window; "all": every loss
             does.
-        target_encoder: "slow": the slow latents come from the encoder's slow copy; "online": from the
-            online encoder, as in the thesis' code (without gradient either way).
-        encoder_optimizer: how RL's and the representation's losses, where both train the encoder, step it.
-            "separate": RL's Adam steps, then the representation's own Adam steps on the same batch, encoded
-            anew by the encoder that RL's step left, as in the thesis' code. Adam does not see the scale of
-            a loss, so the two steps are about as long whatever the losses' weights. "simultaneous":
-            likewise, but both gradients are taken at the same parameters. "summed": one Adam on the
-            gradient of the sum.
-        only: the objectives that this update computes; None for all. The heads of the others do not move.
         slow_follows: whether the slow copies move by their rules; False leaves that to `make_follow`, which
             then must be called after every `follow_every` updates: an update that never writes to the slow
             copies needs no copy of them.
@@ -212,23 +226,12 @@ def make_update(
         over the first's. Those of the encoder are `srl_jax.optim.NOT_MEASURED` but in every k-th
         update, k being `NORM_EVERY`.
     """
-
     if augment not in ("none", "srl", "all"):
         raise ValueError(f"augment must be none, srl or all, not {augment}")
-    if target_encoder not in ("slow", "online"):
-        raise ValueError(f"target_encoder must be slow or online, not {target_encoder}")
-
-    if encoder_optimizer not in ENCODER_OPTIMIZERS:
-        raise ValueError(
-            f"encoder_optimizer must be one of {', '.join(ENCODER_OPTIMIZERS)}, not {encoder_optimizer}"
-        )
-
-    active = {n: o for n, o in objectives.items() if only is None or n in only}
     steps = []
-    for one in passes(mode, active, encoder_optimizer):
-        own = {name: active[name] for name in one.objectives}
-        losses_of = make_losses(encoder, own, mode, augment=augment, target_encoder=target_encoder)
-        steps.append((one, losses_of))
+    for one in passes(mode, objectives) if plan is None else plan:
+        own = {name: objectives[name] for name in one.objectives}
+        steps.append((one, make_losses(encoder, own, mode, augment=augment)))
 
     def update(state: TrainState, window: Window, hyper: Hyper):
         if set(hyper.weights) != set(objectives):
@@ -240,7 +243,7 @@ def make_update(
         metrics: dict[str, Any] = {"loss/total": 0.0}
         lengths: list[tuple[Params, Params]] = []
         for one, losses_of in steps:
-            at = state.params if encoder_optimizer == "simultaneous" else params
+            at = state.params if one.at_start else params
 
             def total(moving: Params):
                 losses, extra = losses_of(at | moving, state, window)  # noqa: B023
@@ -293,7 +296,6 @@ def make_losses(
     mode: Mode,
     *,
     augment: str,
-    target_encoder: str,
 ) -> Callable:
     """losses: (params, TrainState, Window) -> ({name: losses [B]}, {name: metrics}), pure; see `make_update`.
 
@@ -325,46 +327,6 @@ def make_losses(
         return losses, metrics
 
     return losses_of
-
-
-def make_conflict(
-    encoder: Encoder,
-    objectives: Mapping[str, Objective],
-    mode: Mode,
-    *,
-    augment: str,
-    target_encoder: str,
-) -> Callable:
-    """conflict: (TrainState, Window, Hyper) -> {name: (cosine, norm ratio)}, pure; for each but RL.
-
-    The cosine of an objective's gradient on the encoder's parameters with RL's, and its norm over RL's norm,
-    both gradients of `weight * mean(losses)`. Every loss's gradient enters the encoder here, whatever the
-    mode: in mode decoupled it is the gradient that RL's would be.
-    """
-    both = mode._replace(rl_trains_encoder=True, representation_trains_encoder=True)
-
-    def conflict(state: TrainState, window: Window, hyper: Hyper):
-        def gradient(name: str) -> Params:
-            losses_of = make_losses(
-                encoder, {name: objectives[name]}, both, augment=augment, target_encoder=target_encoder
-            )
-
-            def loss(tree: Params) -> Array:
-                losses, _ = losses_of({**state.params, "encoder": tree}, state, window)
-                return hyper.weights[name] * jnp.mean(losses[name])
-
-            return jax.grad(loss)(state.params["encoder"])
-
-        of_rl = gradient(RL)
-        norm = optax.tree.norm(of_rl)
-        found = {}
-        for name in sorted(objectives.keys() - {RL}):
-            other = gradient(name)
-            other_norm = optax.tree.norm(other)
-            found[name] = optax.tree.vdot(of_rl, other) / (norm * other_norm), other_norm / norm
-        return found
-
-    return conflict
 
 
 def follow(objectives: Mapping[str, Objective], params: Params, slow: Params, step: Array) -> Params:
@@ -452,9 +414,13 @@ def make_act(encoder: Encoder, q_values: Callable, *, noisy: bool) -> Callable:
         noise_key, coin_key, action_key = jax.random.split(jax.random.fold_in(key, step), 3)
         z = encoder.apply(params, stack_last(frames))
         q = q_values(head, z, noise_key if noisy else None)
-        number, num_actions = q.shape
-        random = jax.random.randint(action_key, (number,), 0, num_actions)
-        explore = jax.random.uniform(coin_key, (number,)) < epsilon
-        return jnp.where(explore, random, jnp.argmax(q, -1)).astype(jnp.int32)
+        return epsilon_greedy(q, coin_key, action_key, epsilon)
 
     return act
+
+
+def epsilon_greedy(q: Array, coin_key: Array, action_key: Array, epsilon: ArrayLike) -> jax.Array:
+    """int32 [...]: the greedy action of values [..., A], or with probability epsilon one drawn uniformly."""
+    random = jax.random.randint(action_key, q.shape[:-1], 0, q.shape[-1])
+    explore = jax.random.uniform(coin_key, q.shape[:-1]) < epsilon
+    return jnp.where(explore, random, jnp.argmax(q, -1)).astype(jnp.int32)

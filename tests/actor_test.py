@@ -1,13 +1,16 @@
 """srl_jax/actor.py: stacks of frames, seeds, schedules."""
 
 import itertools
+import os
+import sys
+import threading
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax.actor import FrameStack, linear, random_policy, seed_for
+from srl_jax.actor import FrameStack, linear, random_policy, seed_for, yielding_threads
 
 STEP, BEGIN = "step", "begin"
 
@@ -75,3 +78,12 @@ def test_random_policy_is_uniform_and_repeats_with_its_seed():
     assert len(counts) == 4 and counts.min() > 200  # 250 expected, standard deviation 14
     np.testing.assert_array_equal(actions, drawn(7)(frames, 9, 1.0))
     assert not np.array_equal(actions, drawn(8)(frames, 0, 0.0))
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="threads have no priority of their own")
+def test_threads_of_environments_yield_to_their_own_process_alone():
+    def priority():
+        return os.getpriority(os.PRIO_PROCESS, threading.get_native_id())
+
+    with yielding_threads("environments", 1) as threads:
+        assert threads.submit(priority).result() == min(priority() + 5, 19)

@@ -4,8 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.arms import FIGURES
-from experiments.colours import styles
-from experiments.plots import COLOURS
+from experiments.colours import COLOURS, styles
 
 names = st.lists(st.sampled_from([*"abcdefghijk", "joint_256", "rl_only_nature", "joint_50"]), unique=True)
 

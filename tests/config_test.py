@@ -11,8 +11,8 @@ import pytest
 from hypothesis import strategies as st
 
 from srl_jax import config as config_module
-from srl_jax import modes
-from srl_jax.config import INFOS, Config, difference, resolve, told_to_xla
+from srl_jax import modes, provenance
+from srl_jax.config import INFOS, Config, difference, resolve
 from srl_jax.errors import ConfigError
 from srl_jax.specs import LIMITS
 
@@ -172,7 +172,7 @@ def test_git_revision(tmp_path, monkeypatch):
     package.mkdir()
     source = package / "config.py"
     source.write_text("1")
-    monkeypatch.setattr(config_module, "__file__", str(source))
+    monkeypatch.setattr(provenance, "__file__", str(source))
 
     def git(*arguments):
         user = ["-c", "user.name=n", "-c", "user.email=e@example.org", "-c", "commit.gpgsign=false"]
@@ -181,19 +181,19 @@ def test_git_revision(tmp_path, monkeypatch):
         )
         return done.stdout.strip()
 
-    assert config_module.git_revision() is None  # No checkout.
+    assert provenance.git_revision() is None  # No checkout.
     git("init")
-    assert config_module.git_revision() is None  # No commit.
+    assert provenance.git_revision() is None  # No commit.
     git("add", ".")
     git("commit", "-m", "first")
-    assert config_module.git_revision() == git("rev-parse", "HEAD")
+    assert provenance.git_revision() == git("rev-parse", "HEAD")
     source.write_text("2")
-    assert config_module.git_revision() == git("rev-parse", "HEAD") + "-dirty"
+    assert provenance.git_revision() == git("rev-parse", "HEAD") + "-dirty"
     # Installed somewhere below another project's checkout: its commit says nothing about us.
     (tmp_path / "site-packages" / "srl_jax").mkdir(parents=True)
     below = tmp_path / "site-packages" / "srl_jax" / "config.py"
-    monkeypatch.setattr(config_module, "__file__", str(below))
-    assert config_module.git_revision() is None
+    monkeypatch.setattr(provenance, "__file__", str(below))
+    assert provenance.git_revision() is None
 
 
 def test_a_game_is_resolved_to_its_one_name():
@@ -328,11 +328,14 @@ def test_config_json_has_what_xla_was_told(tmp_path, monkeypatch):
     monkeypatch.setenv("NPROC", "2")
     Config().save(tmp_path)
     told = json.loads((tmp_path / "config.json").read_text())["environment"]
-    assert told == {"XLA_FLAGS": "--a --b", "NPROC": "2"} == told_to_xla()
+    assert told == {"XLA_FLAGS": "--a --b", "NPROC": "2"} == provenance.told_to_xla()
 
 
 def test_a_config_of_before_a_field_was_renamed_is_read():
     assert Config.from_json('{"lr_final": 0.25}') == Config(lr_final_share=0.25)
+    assert Config.from_json('{"tensorboard": true}') == Config(loggers=("tensorboard",))
+    assert Config.from_json('{"tensorboard": false}') == Config()
+    assert Config.from_json('{"tensorboard": true, "loggers": []}') == Config()  # resumed since, without
 
 
 def test_what_follows_from_other_fields_follows_again():

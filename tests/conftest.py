@@ -14,6 +14,7 @@ os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
 os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
 atexit.register(shutil.rmtree, _cache, ignore_errors=True)
 
+import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402
 
 # The first example of a property that runs on jax compiles, so no single example has a deadline.
@@ -24,3 +25,17 @@ settings.register_profile(
 )
 settings.register_profile("thorough", max_examples=1000, deadline=None, suppress_health_check=_quiet)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
+
+
+@pytest.fixture
+def loop(monkeypatch):
+    """A stub in place of srl_jax.loop, see `tests.in_process.Loop`."""
+    import sys
+
+    import srl_jax
+    from tests.in_process import Loop
+
+    stub = Loop()
+    monkeypatch.setitem(sys.modules, "srl_jax.loop", stub)
+    monkeypatch.setattr(srl_jax, "loop", stub, raising=False)
+    return stub

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from experiments import control_groups, runtime
-from experiments.sweeping import machine
+from experiments.sweeping import launching
 
 GIB = 2**30
 
@@ -54,7 +54,7 @@ def test_a_job_below_the_root_of_version_2(tree):
         },
     )
     # 4 GiB less 3, one of which is of files that nobody uses.
-    assert control_groups.free_bytes(root) == machine.free_bytes(root) == 2 * GIB
+    assert control_groups.free_bytes(root) == control_groups.free_memory(root) == 2 * GIB
     assert control_groups.cores(root) == 3  # of 2.5
 
 
@@ -74,7 +74,7 @@ def test_a_container_of_version_1(tree):
             "sys/fs/cgroup/cpu,cpuacct/cpu.cfs_period_us": 100000,
         },
     )
-    assert machine.free_bytes(root) == 3 * GIB // 2
+    assert control_groups.free_memory(root) == 3 * GIB // 2
     assert control_groups.cores(root) == 1  # half of one
 
 
@@ -92,20 +92,20 @@ def test_what_is_mounted_is_what_counts(tree, mine, seen_from):
     files = {"sys/fs/cgroup x/memory.max": GIB, "sys/fs/cgroup x/memory.current": 2 * GIB}
     root = tree(mine, mount, {**files, "sys/fs/cgroup x/cpu.max": "400000 100000", "sys/memory.max": 5})
     assert control_groups.folders(root) == [root / "sys/fs/cgroup x"]
-    assert machine.free_bytes(root) == 0 and control_groups.cores(root) == 4
+    assert control_groups.free_memory(root) == 0 and control_groups.cores(root) == 4
 
 
 @pytest.mark.parametrize("mine, mounts", [("", ""), (V2, V2_MOUNT), (V1, V1_MOUNTS), ("x\n:\n::", "y - z")])
 def test_without_a_limit_the_machine_is_what_there_is(tree, tmp_path, mine, mounts):
-    assert machine.free_bytes(tmp_path) is None  # not Linux
+    assert control_groups.free_memory(tmp_path) is None  # not Linux
     root = tree(mine, mounts, {"sys/fs/cgroup/cpu.max": "max 100000", "sys/fs/cgroup/memory.max": "max"})
     assert control_groups.free_bytes(root) is None and control_groups.cores(root) is None
-    assert machine.free_bytes(root) == 32 * GIB
+    assert control_groups.free_memory(root) == 32 * GIB
 
 
 @pytest.mark.parametrize("allowed, found", [(None, 3), (1, 1), (2, 2), (64, 3)])
 def test_cores_are_those_that_affinity_and_groups_allow(monkeypatch, allowed, found):
     monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 5, 7}, raising=False)
     monkeypatch.setattr(control_groups, "cores", lambda: allowed)
-    monkeypatch.setattr(machine, "has_gpu", lambda: False)
-    assert runtime.cores() == machine.most_workers() == found
+    monkeypatch.setattr(runtime, "has_gpu", lambda env: False)
+    assert runtime.cores() == launching.most_workers() == found

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import pytest
 
+from experiments.collect import differs
 from srl_jax.config import Config
 from srl_jax.data import (
     Published,
@@ -63,13 +64,13 @@ def test_published_scores_have_a_source_and_are_there_once(game):
 def test_what_differs_is_said_in_a_line():
     (rainbow,) = [r for r in published("Pong") if r[1:3] == ("Dopamine Rainbow", 1_000_000)]
     assert (rainbow.score, rainbow.spread, rainbow.seeds) == (-16.73, 1.85, 5)
-    assert rainbow.differs_from(PONG, seeds=3) == (
+    assert differs(rainbow, PONG, seeds=3) == (
         "sticky actions 0.25 (here 0.0), epsilon 0.01 (here 0.005), seeds 5 (here 3), "
         "training score (here the mean of 10 evaluation games)"
     )
-    assert "env steps 1,000,000 (here 50,000)" in rainbow.differs_from(PONG, env_steps=50_000)
+    assert "env steps 1,000,000 (here 50,000)" in differs(rainbow, PONG, env_steps=50_000)
     same = Published("Pong", "x", 1_000_000, 0.0, None, 3, "evaluation", 0.25, 0.005, "", "")
-    assert same.differs_from(replace(PONG, sticky_actions=0.25), seeds=3) == ""
+    assert differs(same, replace(PONG, sticky_actions=0.25), seeds=3) == ""
     unknown = same._replace(seeds=None, score_of=None, sticky_actions=None)
-    assert unknown.differs_from(PONG) == "not known: sticky actions, seeds, kind of score"
-    assert published("Pong")[0].differs_from(PONG) == "not known: sticky actions"
+    assert differs(unknown, PONG) == "not known: sticky actions, seeds, kind of score"
+    assert differs(published("Pong")[0], PONG) == "not known: sticky actions"

@@ -9,19 +9,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import diagnostic_plots, draw, plots
+from experiments import plots, run_figures
 from srl_jax import checkpoint, envs
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout, measures
-from srl_jax.diagnostics.device import make_functions
-from srl_jax.diagnostics.measure import Diagnostics, kept_steps
-from srl_jax.diagnostics.rows import drift_matrix
+from srl_jax.diagnostics.drift import drift_matrix
+from srl_jax.diagnostics.functions import make_conflict, make_functions
+from srl_jax.diagnostics.run import Diagnostics, kept_steps
 from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 from srl_jax.optim import RL
 from srl_jax.replay import Replay
 from srl_jax.types import Objective, TrainState
-from srl_jax.update import Hyper, make_conflict
+from srl_jax.update import Hyper
 from tests.helpers import SMALL, jit, make_encoder, make_window, random_params
 
 RNG = np.random.default_rng(0)
@@ -204,8 +204,7 @@ def test_gradient_conflict_of_losses_whose_gradients_are_known():
     hyper = Hyper({RL: np.float32(1), "same": np.float32(4), "against": np.float32(1)}, {})
     # In mode decoupled RL's gradient does not enter the encoder; this is the one that it would be.
     for mode in ("joint", "decoupled"):
-        options = {"augment": "none", "target_encoder": "slow"}
-        conflict = jit(make_conflict(encoder, terms, MODES[mode], **options))
+        conflict = jit(make_conflict(encoder, terms, MODES[mode], augment="none"))
         found = {
             name: [float(x) for x in pair] for name, pair in conflict(state, make_window(), hyper).items()
         }
@@ -220,9 +219,7 @@ def test_an_image_of_two_latents_is_left_out_and_told():
         return latents.online(1), decoder.apply(head, latents.online(0))
 
     terms = {"one": objective(1.0)._replace(image=later, horizon=1)}
-    functions = make_functions(
-        encoder, terms, MODES["pretrain"], channels=1, augment="none", target_encoder="slow"
-    )
+    functions = make_functions(encoder, terms, MODES["pretrain"], channels=1, augment="none")
     assert functions.decode == {} and functions.others == ("one",) and functions.conflict is None
 
 
@@ -336,11 +333,11 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
 @pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
 def test_drift_is_drawn_as_a_matrix_and_numbers_as_curves(tmp_path, monkeypatch):
     figures = []
-    save = diagnostic_plots.save
-    monkeypatch.setattr(diagnostic_plots, "save", lambda f, path: figures.append(f) or save(f, path))
+    save = plots.save
+    monkeypatch.setattr(plots, "save", lambda f, path: figures.append(f) or save(f, path))
     rows = rows_of([0, 10, 20])
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
-    written = draw.draw_run(tmp_path, Config())
+    written = run_figures.draw_run(tmp_path, Config())
     assert {path.name for path in written} == {"diagnostics.png", "drift.png"}
     (shown,) = figures[1].axes[0].images
     np.testing.assert_allclose(shown.get_array(), drift_matrix(rows, "x")[1])
@@ -349,7 +346,7 @@ def test_drift_is_drawn_as_a_matrix_and_numbers_as_curves(tmp_path, monkeypatch)
     rows[3]["diag/drift/steps"].pop()
     (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     with pytest.raises(ConfigError, match="metrics.jsonl: drift of x after 30 env steps"):
-        draw.draw_run(tmp_path, Config())
+        run_figures.draw_run(tmp_path, Config())
 
 
 # Atari

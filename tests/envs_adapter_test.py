@@ -8,10 +8,10 @@ import pytest
 from gymnasium.error import ResetNeeded
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary
 
-from experiments.soaking.snapshots import MOMENTS, Player, goes_on
 from srl_jax import envs
 from srl_jax.envs import adapter, games, pixels
 from srl_jax.errors import ConfigError
+from tests.players import MOMENTS, Player, goes_on
 
 
 class Square(gymnasium.Env):
@@ -279,9 +279,13 @@ def test_an_environment_by_its_id(tmp_path, monkeypatch):
     games.game("gymnasium:id=SrlJaxSquare-v0").check()  # the package is known
     for text, says in (
         ("gymnasium:id=Nonesuch-v0", "cannot be made: NameNotFound: Environment `Nonesuch` doesn't exist"),
-        ("nonesuch_module:A-v0", "cannot be made: ModuleNotFoundError: No module named 'nonesuch_module'"),
+        (
+            "nonesuch_module:A-v0",
+            "cannot be made: ModuleNotFoundError: No module named 'nonesuch_module'",
+        ),
         ("srl_jax_own:Other-v0", "cannot be made: NameNotFound"),
     ):
         with pytest.raises(ConfigError) as raised:
             games.game(text).check()
         assert str(raised.value).startswith(says) and "\n" not in str(raised.value)
+        assert ("--import=PATH/FILE.py" in str(raised.value)) == ("nonesuch_module" in text)

@@ -6,8 +6,8 @@ from gymnasium.error import ResetNeeded
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.soaking.snapshots import MOMENTS, Player, goes_on, same
 from srl_jax import envs
+from tests.players import MOMENTS, Player, goes_on, same
 
 RESET = 255
 """An unseeded reset among the events of Atari's snapshots."""
@@ -178,3 +178,17 @@ def test_a_snapshot_is_a_file_of_plain_arrays(tmp_path):
         again.restore(arrays)
     action = np.array([0, 2])
     assert same(env.step(action)[:4], again.step(action)[:4])
+
+
+def test_two_environments_that_differ_are_noticed():
+    def make(seed=0):
+        return envs.make("Catch", num_envs=2, seed=seed, frame_size=42)
+
+    class Forgets(type(make())):
+        def _restore(self, arrays):
+            return super()._restore(arrays | {"episodes": arrays["episodes"] + 1})
+
+    player = Player.start(make(), 0)
+    forgets = lambda: Forgets(num_envs=2, seed=0, size=42)  # noqa: E731
+    difference, _ = goes_on(player, forgets, player.until("after a step"), 40)
+    assert difference == "a second snapshot differs"

@@ -17,7 +17,7 @@ from experiments import flags as config_flags
 from experiments import train
 from srl_jax import envs
 from srl_jax.config import Config
-from srl_jax.diagnostics import heldout, measure
+from srl_jax.diagnostics import heldout, run
 from srl_jax.metrics import read_metrics
 from srl_jax.types import Latents
 from tests.helpers import make_context, make_window
@@ -31,7 +31,7 @@ SMALL |= {"rl": "rainbow:hidden=16,atoms=11", "encoder": "tiny:features=8"}
 @pytest.fixture
 def few_held_out(monkeypatch):
     monkeypatch.setattr(heldout, "WINDOWS", 64)
-    monkeypatch.setattr(measure, "DECODED", 64)
+    monkeypatch.setattr(run, "DECODED", 64)
 
 
 def trained(*arguments):

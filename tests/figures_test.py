@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import collect, curves, figures
+from experiments import collect, figures, plots
 from experiments import flags as config_flags
 from experiments.arms import FIGURES, Figure, FigureArm
-from experiments.reporting.numbers import compare, rows
+from experiments.reporting.numbers import arms_of, compare, table
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
@@ -131,7 +131,7 @@ def test_an_arm_of_which_all_seeds_failed_is_listed(runs, tmp_path):
 def drawn_notes(monkeypatch):
     """The lines below the figures that would have been drawn."""
     notes = []
-    monkeypatch.setattr(figures.curves, "comparison", lambda *given: notes.append(given[3].splitlines()))
+    monkeypatch.setattr(plots, "draw_panels", lambda *given: notes.append(given[3].splitlines()))
     return notes
 
 
@@ -142,12 +142,13 @@ def test_the_report_has_the_same_numbers(tmp_path):
             mode = "joint" if arm == "b" else "rl_only"
             write_run(tmp_path / f"Catch/{arm}/seed{seed}", returns[5 * i + seed], seed=seed, mode=mode)
     mine = _evaluated(tmp_path)["games"]["Catch"]["arms"]
-    a, b = rows(compare(collect.load_runs(tmp_path), ["a", "b"]), ["a", "b"], "a", {})
-    pairs = [(mine["a"], a.final, a.area), (mine["b"], b.final, b.area)]
-    pairs.append((mine["b"]["against_baseline"], b.final_difference, b.area_difference))
-    for numbers, final, area in pairs:
-        assert tuple(numbers["at_the_end"].values())[:4] == final
-        assert tuple(numbers["area_under_curve"].values())[:4] == area
+    comparisons = {"Catch": compare(collect.load_runs(tmp_path))}
+    for here, there in (("at_the_end", "final"), ("area_under_curve", "area")):
+        found = table(comparisons, there, "a")["Catch"]
+        assert tuple(mine["a"][here].values())[:4] == found["a"]["return"]
+        assert tuple(mine["b"][here].values())[:4] == found["b"]["return"]
+        difference = mine["b"]["against_baseline"][here]
+        assert tuple(difference.values())[:4] == found["b"]["return_difference"]
 
 
 def test_other_games_and_arms_without_runs_are_left_out(runs):
@@ -190,7 +191,7 @@ def test_the_same_runs_give_the_same_bytes(runs, tmp_path):
 
 def test_an_arm_has_one_colour_in_all_figures_of_a_directory_and_on_its_page(runs):
     pytest.importorskip("matplotlib")
-    from experiments.reporting import page
+    from experiments.colours import styles
 
     other = Figure("other", "Other", "?", (FigureArm("b", "catch/joint"), FigureArm("c", "catch/joint")))
     (runs / "Catch/other").rename(runs / "Catch/c")
@@ -198,9 +199,7 @@ def test_an_arm_has_one_colour_in_all_figures_of_a_directory_and_on_its_page(run
     assert among == ["a", "b", "c"]
     first, second = (figures.evaluated(x, read, ["Catch"], among=among)["styles"] for x in (FIGURE, other))
     assert first["b"] == second["b"] and len({tuple(x) for x in (first | second).values()}) == 3
-    options = {"baseline": "b", "reach": {}, "force": True, "finished_only": False, "media": False}
-    report = page.gather([runs], **options)
-    assert {arm: list(style) for arm, style in report.styles.items()} == first | second
+    assert {arm: list(style) for arm, style in styles(arms_of(read)).items()} == first | second
 
 
 def test_all_figures_share_their_runs():
@@ -281,7 +280,7 @@ def test_policies_that_learn_nothing_are_in_the_json_and_drawn(runs, monkeypatch
     assert all(x["source"].startswith("python -m experiments.") for x in policies.values())
     assert all(x["differs"] == "" for x in policies.values())
     given = []
-    monkeypatch.setattr(curves, "comparison", lambda *values: given.extend(values))
+    monkeypatch.setattr(plots, "draw_panels", lambda *values: given.extend(values))
     figures.draw(FIGURE, numbers, runs / "x.png")
     panels, _, _, note, _ = given
     assert "intervals over seeds at each point, Student's t; dash-dotted: policies that learn nothing" in note

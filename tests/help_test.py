@@ -1,11 +1,13 @@
 """experiments/help.py: what --help prints."""
 
+import importlib
 import subprocess
 import sys
 
 import pytest
 from absl import flags
 
+from experiments import flags as config_flags
 from experiments import help, sweep, train
 from experiments.cli import COMMANDS
 from experiments.presets import PIECES, PIECES_HELP, PRESETS
@@ -44,6 +46,7 @@ def test_rows_and_their_options_are_listed_below_their_flag():
             assert f" {name}:" in page
     assert " inverse:weight=1.0,hidden=256 " in page
     assert " sac_ae:features=256,layer_norm=true," in page
+    assert " none stands for no logger tensorboard wandb:project= csv --" in page
     assert " double:double=true,dueling=false,noisy=false," in page
 
 
@@ -63,10 +66,27 @@ def test_a_programs_own_flags_come_first():
     assert page.index("\nFlags:\n") < page.index("  --grid") < page.index("\nRun:\n")
 
 
+@pytest.mark.parametrize("given", ["--verbosity=1", "--verbosit=1"])
+def test_flags_that_absl_brings_along_are_neither_taken_nor_suggested(given, capsys):
+    values = flags.FlagValues()
+    train.define_flags(values)
+    of_absl = flags.Flag(flags.IntegerParser(), None, "verbosity", 0, "of logging")
+    flags.DEFINE_flag(of_absl, values, module_name="absl.logging")
+    with pytest.raises(SystemExit):
+        config_flags.parse(["train", given], values)
+    name = given.partition("=")[0]
+    assert capsys.readouterr().err == f"error: {name}: no such flag; --help lists them all\n"
+
+
 @pytest.mark.parametrize("name", COMMANDS)
-def test_help_ends_with_status_0(name):
-    done = subprocess.run(
-        [sys.executable, "-m", "srl_jax", name, "--help"], capture_output=True, text=True, timeout=120
-    )
+def test_every_command_says_what_it_does_first(name):
+    module = importlib.import_module(f"experiments.{COMMANDS[name].module or name}")
+    first = help.text(module.__doc__, flags.FlagValues()).splitlines()[0]
+    assert f"`srl-jax {name}" in first or name == "figures"
+
+
+def test_help_ends_with_status_0():
+    line = [sys.executable, "-m", "srl_jax", "export", "--help"]
+    done = subprocess.run(line, capture_output=True, text=True, timeout=120)
     assert (done.returncode, done.stderr) == (0, "")
-    assert f"`srl-jax {name}" in done.stdout.splitlines()[0] or name == "figures"
+    assert "`srl-jax export" in done.stdout.splitlines()[0] and "\n  --encoder " in done.stdout

@@ -149,7 +149,7 @@ def test_what_a_run_imports_is_imported_first(tmp_path, monkeypatch):
     file.write_text(OWN)
 
     def forget():
-        monkeypatch.setattr(plugins, "_LOADED", set())
+        monkeypatch.setattr(plugins, "_LOADED", {})
         srl_jax.encoders.REGISTRY.pop("own_for_loading", None)
 
     try:

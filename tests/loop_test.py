@@ -17,7 +17,7 @@ from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
 from experiments import flags as config_flags
-from srl_jax import actor, checkpoint, ending, loading, loop
+from srl_jax import actor, checkpoint, ending, loading, loop, seed, training
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
@@ -237,7 +237,7 @@ def test_pretraining_on_a_given_policy_and_on_a_random_one(joint, tmp_path):
     train(tmp_path / "frozen", mode="frozen", encoder_from=str(tmp_path / "random"))
     config = Config(**SMALL, mode="pretrain", objectives=("inverse",), policy_from=str(tmp_path / "random"))
     with pytest.raises(ConfigError, match="has no policy"):
-        checkpoint.check_sources(config)
+        training.check_sources(config)
 
 
 def test_a_buffer_that_cannot_be_is_refused():
@@ -292,7 +292,7 @@ def test_an_encoder_that_does_not_fit_is_refused(joint):
     for field, value in (("encoder", "tiny:features=16"), ("frame_size", 84), ("frame_stack", 2)):
         config = Config(**{**SMALL, "mode": "frozen", "encoder_from": str(source), field: value})
         with pytest.raises(ConfigError, match=f"{field} is .* there and .* here"):
-            checkpoint.check_sources(config)
+            training.check_sources(config)
 
 
 def test_ctrl_c_in_the_middle_of_a_step_leaves_the_last_checkpoint(tmp_path, monkeypatch, capsys):
@@ -305,12 +305,15 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_the_last_checkpoint(tmp_path, mon
 
     monkeypatch.setattr(Replay, "add", add)
     path = tmp_path / "run"
-    result = train(path, **JOINT, checkpoint_every=40, progress=True)
+    pytest.importorskip("tensorboardX")
+    result = train(path, **JOINT, checkpoint_every=40, progress=True, loggers=("tensorboard",))
     # The step from 96 to 100 was being added; it does not count.
     assert result.interrupted and result.env_steps == 96
     assert "interrupted after 96 env steps; the last checkpoint is of 80" in capsys.readouterr().err
     assert whole(path).env_steps == 80 and "run.json" in whole(path).files
     assert "reconstruction" in result.pictures
+    (events,) = (path / "tensorboard").iterdir()
+    assert b"pictures/reconstruction" in events.read_bytes()
 
 
 def test_a_run_that_is_told_to_stop_saves_and_says_so(tmp_path, capsys):
@@ -322,20 +325,20 @@ def test_a_run_that_is_told_to_stop_saves_and_says_so(tmp_path, capsys):
     assert whole(path).env_steps == 52 and "run.json" in whole(path).files
 
 
-def test_a_stop_right_after_a_checkpoint_waits_for_no_evaluation(tmp_path, capsys, monkeypatch):
-    original = loop.Run.play
+@pytest.mark.parametrize("env_steps", [120, 132])
+def test_a_stop_waits_for_no_evaluation(tmp_path, capsys, monkeypatch, env_steps):
+    original = seed.evaluate
 
-    def play(run, i, params, env_steps):  # the second evaluation takes as long as anybody waits for it
-        while env_steps and not run.left:
+    def play(policy, env, *, stop, **options):  # takes as long as anybody waits for it
+        while options["seed"] == actor.seed_for(0, "eval", 120) and not stop():
             time.sleep(0.01)
-        return original(run, i, params, env_steps)
+        return original(policy, env, stop=stop, **options)
 
-    monkeypatch.setattr(loop.Run, "play", play)
+    monkeypatch.setattr(seed, "evaluate", play)
     calls = itertools.count()
-    result = train(tmp_path / "run", progress=True, stop=lambda: next(calls) == 30)
-    assert result.interrupted and result.env_steps == result.saved == 120
-    said = capsys.readouterr().err
-    assert "stopped after 120 env steps; a checkpoint is written" in said and "stopping once" not in said
+    result = train(tmp_path / "run", progress=True, stop=lambda: next(calls) == env_steps // 4)
+    assert result.interrupted and result.env_steps == result.saved == env_steps
+    assert f"stopped after {env_steps} env steps; a checkpoint is written" in capsys.readouterr().err
 
 
 def broken(update, at, name, td_error):
@@ -439,7 +442,8 @@ def test_a_row_that_cannot_be_written_ends_the_run_with_its_threads(tmp_path, mo
     before = threading.active_count()
     with pytest.raises(SaveError, match="metrics.jsonl: a row was not written: No space left"):
         train(tmp_path / "run", checkpoint_every=20)
-    assert whole(tmp_path / "run").env_steps == 120  # before the evaluation whose row it is
+    manifest = whole(tmp_path / "run")  # where the evaluation whose row it is was under way
+    assert manifest.env_steps == 140 and "evaluating.msgpack" in manifest.files
     assert threading.active_count() <= before
 
 
@@ -545,7 +549,7 @@ def test_updates_are_compiled_once(joint):
     (seed,) = run.seeds
     run.begin()
     for _ in range(30):
-        seed.take(seed.step_env(np.ones(4, np.int32)))
+        seed.take(*seed.step_env(np.ones(4, np.int32)))
     for _ in range(3):
         run.update()
         run.env_steps += 40  # another learning rate

@@ -1,6 +1,5 @@
 import hashlib
 import json
-import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -149,46 +148,6 @@ def test_strip_wall_removes_what_the_clock_decides_and_nothing_else():
     row = {"kind": "train", "wall_s": 1.0, "wall_steps_per_s": 2.0, "loss/wall_e": 3.0}
     assert strip_wall(row) == {"kind": "train", "loss/wall_e": 3.0}
     assert "wall_s" in row
-
-
-def events(file):
-    from tensorboardX.proto.event_pb2 import Event
-
-    data, found = file.read_bytes(), []
-    while data:  # a record: length (8 bytes), its checksum (4), the event, its checksum (4)
-        length = int.from_bytes(data[:8], "little")
-        found.append(Event.FromString(data[12 : 12 + length]))
-        data = data[16 + length :]
-    return found
-
-
-def test_tensorboard_gets_the_scalars(tmp_path):
-    pytest.importorskip("tensorboardX")
-    values = {"loss/rl": np.float32(0.5), "eval/returns": [1.0, 2.0], "note": "x"}
-    with MetricsWriter(tmp_path / "metrics.jsonl", tmp_path / "events") as writer:
-        writer.write("train", 320, 1, 0.0, values)
-    (file,) = (tmp_path / "events").iterdir()
-    found = [(e.step, v.tag, v.simple_value) for e in events(file) for v in e.summary.value]
-    assert found == [(320, "loss/rl", 0.5)]
-
-
-def test_tensorboard_hides_what_a_run_had_written_after_the_mark(tmp_path):
-    pytest.importorskip("tensorboardX")
-    with MetricsWriter(tmp_path / "metrics.jsonl", tmp_path / "first") as writer:
-        mark = writer.mark()
-        writer.write("train", 400, 1, 0.0, {})
-    with MetricsWriter(tmp_path / "metrics.jsonl", tmp_path / "second", mark, 320):
-        pass
-    (file,) = (tmp_path / "second").iterdir()
-    starts = [e.step for e in events(file) if e.WhichOneof("what") == "session_log"]
-    assert starts == [321]  # TensorBoard drops events of the other files from this step on
-
-
-def test_missing_tensorboard_names_the_extra_and_writes_nothing(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "tensorboardX", None)
-    with pytest.raises(ImportError, match=r"pip install srl-jax\[tensorboard\]"):
-        MetricsWriter(tmp_path / "metrics.jsonl", tmp_path / "events")
-    assert not list(tmp_path.iterdir())
 
 
 def test_rows_are_strict_json(tmp_path):

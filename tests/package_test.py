@@ -47,7 +47,7 @@ def test_every_package_is_installed_but_what_only_a_checkout_needs():
         for folder, name in folders.items()
         for path in (ROOT / folder).rglob("__init__.py")
     ]
-    checkout_only = {"srl_jax.experiments.benchmarks", "srl_jax.experiments.soaking"}
+    checkout_only = {"srl_jax.experiments.benchmarks"}
     assert sorted(named) == sorted(set(found) - checkout_only)
 
 
@@ -73,7 +73,12 @@ def test_the_wheel_has_one_top_level_name_and_everything_that_runs(tmp_path):
         file.extractall(tmp_path / "installed")
     assert {name.split("/")[0].split("-")[0] for name in names} == {"srl_jax"}
     assert not [name for name in names if re.search("soak|benchmark|results/", name)]
-    assert "srl_jax/experiments/reporting/style.css" in names and "srl-jax = srl_jax.__main__:main" in scripts
+    page = {
+        path.relative_to(ROOT) for path in (ROOT / "experiments/reporting").rglob("*.*") if path.is_file()
+    }
+    page = {f"srl_jax/{path}" for path in page if path.suffix != ".pyc"}
+    assert "srl_jax/experiments/reporting/templates/page.html.j2" in page and page <= set(names)
+    assert "srl-jax = srl_jax.__main__:main" in scripts
     done = _command("train", "--game=Pogn", cwd=tmp_path, env={"PYTHONPATH": str(tmp_path / "installed")})
     assert (done.returncode, done.stderr[:19]) == (2, "error: --game=Pogn:")
 
@@ -88,7 +93,9 @@ def test_the_library_is_one_import_and_costs_nothing_until_it_is_used():
         from srl_jax import *
         from srl_jax.replay import Replay as replay
         from srl_jax.rl import losses as rl_losses
-        same = Replay is replay and losses is rl_losses and "inverse" in objectives.REGISTRY
+        import srl_jax.losses, srl_jax.objectives, srl_jax.encoders
+        same = Replay is replay and srl_jax.losses is losses is rl_losses
+        same = same and "inverse" in objectives.REGISTRY
         sys.exit(not (light and same and callable(load) and dir(srl_jax) == srl_jax.__all__))
     """
     assert subprocess.run([sys.executable, "-W", "error", "-c", code], cwd=ROOT, timeout=120).returncode == 0

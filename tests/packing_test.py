@@ -181,7 +181,7 @@ def test_a_figure_and_a_page_are_the_same_from_packed_runs(root, tmp_path):
     for out in (root, tmp_path / "packed/runs"):
         values = flags.FlagValues()
         report.define_flags(values)
-        page = tmp_path / f"{out.parent.name}.html"
+        page = tmp_path / f"page_of_{out.parent.name}/page.html"
         config_flags.parse(["report", f"--runs={out}", f"--out={page}", "--force"], values)
         pages.append(report.report(values).read_bytes())
     for name in ("6.3.json", "6.3.png"):

@@ -9,8 +9,11 @@ import subprocess
 import sys
 
 import pytest
+from absl import flags
 
-from srl_jax import plugins
+from experiments import evaluate, train
+from experiments import flags as config_flags
+from srl_jax import objectives, plugins
 from srl_jax.checkpoint import read_manifest
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
@@ -33,7 +36,7 @@ def smallness(context, *, weight: float = 1.0):
 
     return Objective(lambda key: {}, loss, horizon=1, weight=weight)
 """
-RUN = SMALL | {"steps": 160, "eval_every": 80, "mode": "joint"}
+RUN = SMALL | {"steps": 120, "eval_every": 60, "mode": "joint"}
 FLAGS = [*(f"--{name}={value}" for name, value in RUN.items()), "--tune_runtime=off", "--objective=smallness"]
 
 
@@ -210,18 +213,36 @@ def test_plugins_import_no_jax():
 # Programs
 
 
-def _run(program, *arguments, cwd):
-    line = [sys.executable, "-m", f"experiments.{program}", *arguments]
-    env = {**os.environ, "PYTHONPATH": str(ROOT)}
-    done = subprocess.run(line, cwd=cwd, env=env, capture_output=True, text=True, timeout=300)
-    return done
+@pytest.fixture
+def fresh(monkeypatch):
+    """A process that has imported nothing of the user's yet, whenever it is called."""
+
+    def forget():
+        plugins._LOADED.clear()
+        dict.pop(objectives.REGISTRY, "smallness", None)
+        objectives.REGISTRY._origins.pop("smallness", None)
+
+    monkeypatch.setattr(sys, "path", list(sys.path))
+    yield forget
+    forget()
 
 
-def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path):
+def _called(main, define_flags, arguments):
+    values = flags.FlagValues()
+    define_flags(values)
+    config_flags.parse(["program", *arguments], values)
+    return main(values)
+
+
+def _train(*arguments):
+    return _called(train.train, train.define_flags, arguments)
+
+
+def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path, fresh, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(train, "draw", lambda *_: None)  # figures have tests of their own
     (tmp_path / "mine.py").write_text(MINE)
-    flags = ["--import=mine", *FLAGS, "--out=run"]
-    done = _run("train", *flags, cwd=tmp_path)
-    assert done.returncode == 0, done.stderr
+    assert _train("--import=mine", *FLAGS, "--out=run") == 0
     run = tmp_path / "run"
     assert Config.load(run).imports == (str(tmp_path / "mine.py"),)
     assert Config.load(run).objectives == ("smallness:weight=1.0",)
@@ -229,36 +250,46 @@ def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path):
     assert any("loss/smallness" in row for row in rows)
 
     # It moved: what is typed beside a program counts.
+    def evaluated(*arguments):
+        def main(values):
+            monkeypatch.setattr(evaluate, "FLAGS", values)
+            evaluate.main(["evaluate"])
+
+        _called(main, evaluate.define_flags, [f"--run={run}", "--games=2", *arguments])
+        return json.loads(capsys.readouterr().out)
+
+    fresh()
     moved = tmp_path / "elsewhere"
     moved.mkdir()
     (tmp_path / "mine.py").rename(moved / "renamed.py")
-    done = _run("evaluate", "--tune_runtime=off", "--run=run", "--games=2", cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (2, 1)
-    assert done.stderr.startswith(f"error: --import={tmp_path}/mine.py: no such file; --import=PATH says")
-    again = ["--import=renamed", "--tune_runtime=off", f"--run={run}", "--games=2"]
-    done = _run("evaluate", *again, cwd=moved)
-    assert done.returncode == 0 and len(json.loads(done.stdout)["returns"]) == 2, done.stderr
+    monkeypatch.chdir(moved)
+    with pytest.raises(ConfigError, match=f"^--import={tmp_path}/mine.py: no such file; --import=PATH says"):
+        evaluated()
+    capsys.readouterr()
+    assert len(evaluated("--import=renamed")["returns"]) == 2
+    fresh()
     newest = read_manifest(run).path
     newest.rename(newest.with_name(".gone"))
-    done = _run("train", "--import=renamed.py", *FLAGS, f"--out={run}", "--resume=auto", cwd=moved)
-    assert done.returncode == 0, done.stderr
-    assert [row["env_steps"] for row in read_metrics(run / "metrics.jsonl")][-1] == 160
+    assert _train("--import=renamed.py", *FLAGS, f"--out={run}", "--resume=auto") == 0
+    assert [row["env_steps"] for row in read_metrics(run / "metrics.jsonl")][-1] == 120
     # Without it, the name is unknown.
-    done = _run("train", *FLAGS, f"--out={tmp_path}/other", cwd=moved)
-    assert done.returncode == 2 and "no 'smallness'; valid: reconstruction," in done.stderr
+    fresh()
+    with pytest.raises(ConfigError, match="no 'smallness'; .*valid: reconstruction,"):
+        _train(*FLAGS, f"--out={tmp_path}/other")
 
 
 def test_a_sweep_gives_its_runs_what_they_import(tmp_path):
+    # Processes: that they are given it is the point. The run ends before its first update.
     (tmp_path / "mine.py").write_text(MINE)
     flags = [flag for flag in FLAGS if not flag.startswith("--game=")]
-    done = _run(
-        "sweep",
-        "--presets=catch/joint",
-        "--import=mine.py",
-        *flags,
-        "--out=runs",
-        "--games=Catch",
+    line = [sys.executable, "-m", "experiments.sweep", "--presets=catch/joint", "--import=mine.py"]
+    done = subprocess.run(
+        [*config_flags.last_of_each((*line, *flags, "--steps=8")), "--out=runs", "--games=Catch"],
         cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr
     config = Config.load(tmp_path / "runs/Catch/joint/seed0")

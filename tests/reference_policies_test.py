@@ -10,6 +10,7 @@ from absl import flags
 
 from experiments import flags as config_flags
 from experiments import reference_policies as played
+from experiments.collect import differs
 from srl_jax.config import Config
 from srl_jax.data import POLICIES, published, reference_policies
 from srl_jax.envs import ATARI_57
@@ -72,11 +73,11 @@ def test_the_table_is_complete(game):
         if game in THESIS:
             assert row.episodes == {"random": 30, "no-op": 10}[policy]
             assert (row.sticky_actions, row.noop_max) == (0.0, 30)
-            assert row.differs_from(Config(game=game)) == ""
-            told = row.differs_from(Config(game=game, sticky_actions=0.25))
+            assert differs(row, Config(game=game)) == ""
+            told = differs(row, Config(game=game, sticky_actions=0.25))
             assert told == "sticky actions 0.0 (here 0.25)"
         else:  # which has no such thing
-            assert row.differs_from(Config(game=game, sticky_actions=0.25, noop_max=1)) == ""
+            assert differs(row, Config(game=game, sticky_actions=0.25, noop_max=1)) == ""
 
 
 def test_other_games_have_the_published_score_of_a_random_policy():
@@ -84,7 +85,7 @@ def test_other_games_have_the_published_score_of_a_random_policy():
         (row,) = reference_policies(game).values()
         assert (row.policy, row.return_mean) == ("random", published(game)[0].score)
         assert "dqn_zoo" in row.source and row.episodes is None
-        assert row.differs_from(Config(game=game)).startswith("published, ")
+        assert differs(row, Config(game=game)).startswith("published, ")
     assert reference_policies("Chess") == {}
 
 

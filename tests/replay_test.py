@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from experiments.soaking.replay_reference import (
+from srl_jax.replay import Replay
+from tests.replay_reference import (
     EVENTS,
     RESET,
     STEP,
@@ -16,7 +17,6 @@ from experiments.soaking.replay_reference import (
     Driver,
     same_state,
 )
-from srl_jax.replay import Replay
 
 
 @st.composite

@@ -1,7 +1,11 @@
 """experiments.report: what is on the page, its numbers by hand, and what it refuses."""
 
+import base64
+import csv
 import dataclasses
+import io
 import json
+import re
 import shutil
 from html.parser import HTMLParser
 
@@ -9,17 +13,18 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import collect, plots, report
+from experiments import collect, images, plots, report
 from experiments import flags as config_flags
 from experiments.collect import RunData
-from experiments.reporting import browser, configs, overview
 from srl_jax import ending
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from tests.helpers import NOT_FINITE
 
-pytestmark = pytest.mark.skipif(not plots.available(), reason="needs the extra plots")
+Image = pytest.importorskip("PIL.Image", reason="needs the extra plots")
+pages = pytest.importorskip("experiments.reporting.page", reason="needs the extra plots")
+configs, gallery, numbers, pictures = pages.configs, pages.gallery, pages.numbers, pages.gallery.pictures
 
 ODD = '<b>&"odd"'
 """Of an arm whose name is HTML."""
@@ -31,6 +36,18 @@ CURVES = {
     (ODD, 0): [-1.0, -1.0, -1.0],
 }
 """Returns at 0, 100, 200 (and 300) env steps; joint goes on further than the others do."""
+README = """# Does it *help*?
+
+Yes, <script>alert(1)</script> [more](../other.md), [there](https://example.org) and [no](javascript:x).
+
+## Why
+
+| a | b |
+|---|---|
+| 1 | 2 |
+
+![drawn](figures/reconstruction.png) ![gone](figures/gone.png) ![outside](../secret.png)
+"""
 
 
 def write_run(path, returns=(), *, speed=100.0, diag=None, **values):
@@ -50,13 +67,13 @@ def write_run(path, returns=(), *, speed=100.0, diag=None, **values):
         rows[-1] |= {key: x[i] for key, x in (diag or {}).items()} | {"wall_s": 3600.0 * i}
     for step in (100, 200):
         row = {"kind": "train", "env_steps": step, "updates": 1, "wall_s": 3600.0 * step / 100}
-        rows.append(row | {"wall_steps_per_s": speed})
+        rows.append(row | {"wall_steps_per_s": speed, "loss/rl": 1.5, "train/return_mean": -0.5})
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     return path
 
 
 class Page(HTMLParser):
-    """What is in a page: its elements, its text, its tables, and whether everything that opens is closed."""
+    """What is in a page: its elements, its text, its tables; everything that opens is closed."""
 
     def __init__(self, text):
         super().__init__()
@@ -65,17 +82,18 @@ class Page(HTMLParser):
         self.close()
         assert not self.open
         self.text = " ".join("".join(self.words).split())
+        self.pictures = [attributes["alt"] for tag, attributes in self.attributes if tag == "img"]
 
     def handle_starttag(self, tag, attributes):
         self.attributes.append((tag, dict(attributes)))
         if tag not in ("meta", "link", "img", "wbr"):
             self.open.append(tag)
-        if tag == "div" and dict(attributes).get("role") == "region":
-            self.tables.append((dict(attributes)["aria-label"], []))
+        if tag == "table":
+            self.tables.append([])
         elif tag == "tr":
-            self.tables[-1][1].append([])
+            self.tables[-1].append([])
         elif tag in ("td", "th"):
-            self.tables[-1][1][-1].append("")
+            self.tables[-1][-1].append("")
 
     def handle_endtag(self, tag):
         assert self.open.pop() == tag
@@ -86,24 +104,22 @@ class Page(HTMLParser):
         if "style" not in self.open:
             self.words.append(data)
         if {"td", "th"} & set(self.open):
-            cells = self.tables[-1][1][-1]
-            cells[-1] = " ".join((cells[-1] + data).split(" ")) if data != " " else cells[-1].rstrip() + " "
+            self.tables[-1][-1][-1] += data
 
     def table(self, label):
-        """Row heading -> {column heading, or its place: cell}, of the table with this label."""
-        (rows,) = [rows for name, rows in self.tables if name == label]
-        return {row[0].strip(): [cell.strip() for cell in row[1:]] for row in rows}
+        """Row heading -> its other cells, of the table with this label."""
+        labels = [a.get("aria-label") for tag, a in self.attributes if tag == "div" and "tabindex" in a]
+        (rows,) = [rows for name, rows in zip(labels, self.tables, strict=True) if name == label]
+        return {" ".join(row[0].split()): [" ".join(cell.split()) for cell in row[1:]] for row in rows}
 
 
 def build(*runs, **options):
-    from experiments.reporting import page
-
-    return page.build(*runs, **options)
+    return pages.build(*runs, **options)[0]
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory):
-    """Three arms on Catch, one with a name that is HTML; a figure, pictures, diagnostics of one."""
+    """Three arms on Catch, one with a name that is HTML; a README, a figure, pictures, diagnostics of one."""
     root = tmp_path_factory.mktemp("report") / "runs"
     lists = {"diag/drift/steps": [[], [0], [0, 100]], "diag/drift/cka": [[], [0.5], [0.25, 0.75]]}
     for (arm, seed), returns in CURVES.items():
@@ -111,24 +127,30 @@ def runs(tmp_path_factory):
         diag = (
             {"diag/effective_rank": [3.0, 2.0, None], "diag/new": [1, 2, 3], **lists} if arm == ODD else None
         )
-        speed = 50.0 if arm == "joint" else 100.0
-        place = root / f"Catch/{arm}/seed{seed}"
         if arm == "joint":
             own |= {"steps": 300} if seed == 0 else {"steps": 300, "eval_games": 10}
-        write_run(place, returns, speed=speed, diag=diag, seed=seed, **own)
-    frames = np.zeros((30, 42, 42, 1), np.uint8)
-    plots.gif(frames, root / "Catch/rl/seed0/figures/play.gif")
+        speed = 50.0 if arm == "joint" else 100.0
+        write_run(root / f"Catch/{arm}/seed{seed}", returns, speed=speed, diag=diag, seed=seed, **own)
+    images.gif(np.zeros((30, 42, 42, 1), np.uint8), root / "Catch/rl/seed0/figures/play.gif")
     image = np.zeros((2, 8, 8, 1), np.float32)
-    plots.image_panel(image, image, image, root / "Catch/joint/seed0/figures/reconstruction.png", "")
-    shutil.copytree(root / "Catch/joint/seed0/figures", root / "figures")
-    about = {"figure": "6.3", "title": "Joint <script>", "question": "Does it help?"}
-    (root / "figures/reconstruction.json").write_text(json.dumps(about))
+    for name in ("reconstruction", "other"):
+        images.image_panel(image, image, image, root / f"figures/{name}.png", "")
+    shutil.copytree(root / "figures", root / "Catch/joint/seed0/figures")
+    about = {
+        "figure": "6.3",
+        "title": "Joint <script>",
+        "question": "Is it?",
+        "styles": {"rl": ["#000000", "-"]},
+    }
+    (root / "figures/other.json").write_text(json.dumps(about))
+    (root / "README.md").write_text(README)
+    shutil.copy(root / "figures/other.png", root.parent / "secret.png")
     return root
 
 
 @pytest.fixture(scope="module")
 def text(runs):
-    return build(runs, baseline="rl")
+    return build(runs, baseline="rl", data="report.csv")
 
 
 @pytest.fixture(scope="module")
@@ -136,42 +158,54 @@ def page(text):
     return Page(text)
 
 
-def test_what_a_run_went_on_under_is_said(tmp_path):
-    run = write_run(tmp_path / "run")
-    path = run / "config.json"
-    changed = {"jax": "1.3", "git_revision": "fedcba9876543210-dirty", "cpus": 8}
-    path.write_text(
-        json.dumps(json.loads(path.read_text()) | {"continued": [{"env_steps": 100, "changed": changed}]})
-    )
-    about = configs.about(collect.load_run(run))
-    assert dict(about.versions) == {"jax": "1.2.3, then 1.3"} and about.cpus == "none, then 8"
-    assert overview._short(about) == "0123456789, then fedcba9876-dirty"
-
-
 def test_nothing_is_asked_for_from_outside(page):
     for tag, attributes in page.attributes:
         assert tag not in ("script", "iframe", "object", "form", "base")
         assert not [name for name in attributes if name.startswith("on")]
-        for name in ("src", "href", "srcset", "action"):
-            assert attributes.get(name, "#").startswith(("#", "data:"))
-    policy = next(
-        a["content"] for _, a in page.attributes if a.get("http-equiv") == "Content-Security-Policy"
-    )
-    assert policy.startswith("default-src 'none'")
+        for name in ("src", "srcset", "action"):
+            assert attributes.get(name, "data:").startswith("data:")
+    policies = [a["content"] for _, a in page.attributes if a.get("http-equiv") == "Content-Security-Policy"]
+    assert policies[0].startswith("default-src 'none'")
     ids = [attributes["id"] for _, attributes in page.attributes if "id" in attributes]
-    links = [attributes["href"] for tag, attributes in page.attributes if tag == "a"]
-    assert links == [f"#{name}" for name in ids] and len(set(ids)) == len(ids) == 12
-    assert all(a["alt"] for tag, a in page.attributes if tag == "img")
+    links = [attributes["href"] for tag, attributes in page.attributes if tag == "a" and "href" in attributes]
+    assert links == ["report.csv", *(f"#{name}" for name in ids), "https://example.org"]
+    assert len(set(ids)) == len(ids) == 12 and all(page.pictures)
+
+
+def test_the_question_and_the_arms_come_first(page, text):
+    head, answer, numbers_, rest = text.split("<h2>", 3)
+    assert "<h1>Does it help?</h1>" in head and "Yes, &lt;script&gt;alert(1)&lt;/script&gt;" in answer
+    assert "<h3>Why</h3>" in answer and [["a", "b"], ["1", "2"]] in page.tables
+    # Its picture is shown there, and is not shown again; what is not there, or lies outside, is its text.
+    assert "drawn" in page.pictures and "gone outside" in page.text
+    assert page.pictures.count("reconstruction") == 0 and "Figure 6.3. Joint <script>" in page.pictures
+    assert "RL alone (the baseline)" in page.text
+    joint = (
+        "both in every update, and both train the encoder; objectives reconstruction; reconstruction weight 2"
+    )
+    assert joint in page.text
+    assert "What the numbers say" in numbers_ and "Its colours are not this page&#39;s" in rest
 
 
 def test_every_arm_and_every_run_is_there_as_text(page, text):
     assert ODD in page.text and "<b>" not in text and "<script" not in text
-    assert "Figure 6.3. Joint <script> Does it help?" in page.text
-    runs = page.table("Every run")
-    assert {f"Catch / {arm} / seed {seed}" for arm, seed in CURVES} < set(runs)
-    assert runs["Catch / joint / seed 0"][:4] == ["300 of 300", "yes", "4", "5.00 at 300"]
-    assert "4 of 5 runs" in page.text and "Catch / joint / seed 1: 200 of 300 env steps" in page.text
+    assert "Figure 6.3. Joint <script> Is it?" in page.text
+    every = page.table("Every run")
+    assert {f"Catch / {arm} / seed {seed}" for arm, seed in CURVES} < set(every)
+    assert every["Catch / joint / seed 0"][:4] == ["300 of 300", "yes", "4", "5.00 at 300"]
+    assert "4 of 5 runs complete" in page.text and "Catch / joint / seed 1: 200 of 300 env steps" in page.text
     assert "0123456789" in page.text and "2026-01-02 03:04:05" in page.text and "jax 1.2.3" in page.text
+
+
+def test_an_arm_has_one_colour_on_the_whole_page(text):
+    marks = re.findall(
+        r'<span class="mark" style="border-top: 3px (\w+ #\w+)"></span>\s*(?:Catch / )?([^<(]+)', text
+    )
+    found = {}
+    for colour, arm in marks:
+        found.setdefault(arm.strip(), set()).add(colour)
+    assert set(found) == {"rl", "joint", "&lt;b&gt;&amp;&#34;odd&#34;"} and len(marks) > 12
+    assert all(len(colours) == 1 for colours in found.values()) and len(set.union(*found.values())) == 3
 
 
 def test_numbers_by_hand(page):
@@ -184,149 +218,150 @@ def test_numbers_by_hand(page):
     assert table["rl"][3] == "0.31 [−2.07, 2.69]"
     # One of rl's two runs is at 0.75 after 150 env steps, the other one never.
     assert table["rl"][5] == "> 200 [150, > 200] too narrow, 1 of 2 did"
-    assert table["joint"][1:3] == ["1.00 (no interval)", "+0.25 [−2.93, +3.43]"]
-    assert table["joint"][3:5] == ["0.75 (no interval)", "+0.44 [−1.94, +2.82]"]
+    assert table["joint"][1:3] == ["1.00 (no interval)", "+0.25 over 0.75 [−2.93, +3.43]"]
+    assert table["joint"][3:5] == ["0.75 (no interval)", "+0.44 over 0.31 [−1.94, +2.82]"]
     assert table["joint"][5] == "75 [75, 75] too narrow, 2 of 2 did"
-    assert table[ODD][:3] == ["1", "−1.00 (no interval)", "−1.75 (no interval)"]
+    assert table[ODD][:3] == ["1", "−1.00 (no interval)", "−1.75 under 0.75 (no interval)"]
     assert "Compared up to 200 env steps, where rl, seed 0, ended." in page.text
-    # Human-normalised: a miss is -1 and a catch 1. A tie counts half: (0.5 + 1) / 2.
+    # Normalised: a miss is -1 and a catch 1. A tie counts half: (0.5 + 1) / 2.
     over = page.table("The return at the end, over games")
     # Of one game the mean has its t interval, 0.125 * 12.706 to either side; what is no mean is drawn again.
-    assert over["joint"][1] == "1.00 (no interval)" and over["rl"][1] == "0.88 [−0.71, 2.46]"
-    assert over["joint"][4:] == ["0.00 (no interval)", "0.75 [0.50, 1.00] too narrow"]
-
-
-def test_policies_that_learn_nothing_are_beside_the_arms(page):
-    rows = page.table("Statistics of Catch")
+    assert over["joint"][0] == "1.00 (no interval)" and over["rl"][0] == "0.88 [−0.71, 2.46]"
+    assert over["joint"][3:5] == ["0.00 (no interval)", "0.75 [0.50, 1.00] too narrow"]
+    assert "in Catch, a return of −1 is 0 and one of 1 is 1;" in page.text and "human" not in page.text
     for name, policy in reference_policies("Catch").items():
-        score = f"{policy.return_mean:.2f}".replace("-", "−")
-        cells = rows[f"{name} policy"]
-        assert cells == ["–", f"{score} (5,000 games)", "–", f"{score} (5,000 games)", "–", "–"]
-        assert f"a {name} policy has {score}" in page.text
-        # A miss is 0 and a catch 1: half of what is above -1. One game has one mean, median and so on.
+        cell = f"{policy.return_mean:.2f} (5,000 games)".replace("-", "−")
+        assert table[f"{name} policy"] == ["–", cell, "–", cell, "–", "–"]
         normal = (policy.return_mean + 1) / 2
-        over = page.table("The return averaged over env steps, over games")[f"{name} policy"]
-        assert over == ["–", *[f"{normal:.2f}"] * 3, f"{1 - normal:.2f}", "–"]
+        assert over[f"{name} policy"] == [*[f"{normal:.2f}"] * 3, f"{1 - normal:.2f}", "–", "–"]
 
 
 def test_two_seeds_tell_little(page):
-    assert "rl has 0.31 [−2.07, 2.69]. No arm differs from it by Welch's t test at 5 %." in page.text
-    assert "Above it" not in page.text and "▲" not in "".join(page.table("Statistics of Catch")["joint"])
-    assert "1 arm without an interval" in page.text
+    assert f"rl has 0.31 [−2.07, 2.69]. Not told apart: joint. No interval: {ODD}." in page.text
+    assert "Better:" not in page.text and "▲" not in "".join(page.table("Statistics of Catch")["joint"])
 
 
-def test_over_games_nothing_is_said_of_a_bootstrap_that_is_too_narrow(tmp_path):
-    for game in ("Catch", "CatchDistractor"):
-        for arm, end in (("rl_only_256", 0.0), ("joint_256", 5.0)):
-            mode = "rl_only" if arm == "rl_only_256" else "joint"
-            for seed in range(3):
-                write_run(
-                    tmp_path / game / arm / f"seed{seed}", [0.0, end + seed], seed=seed, mode=mode, game=game
-                )
-    page = Page(build(tmp_path, media=False))
-    over = page.text.partition("Over games, interquartile mean")[2]
-    assert "Too few seeds to say whether they differ from it: joint_256;" in over
-    assert "Above it" not in over.partition("Intervals are")[0]
-    assert page.table("The return at the end, over games")["joint_256"][0].endswith("too narrow")
-    # On each game alone Welch's test tells: 5 apart, a standard error of sqrt(2 / 3), and 2.776 times that.
-    assert "Above it, by Welch's t test at 5 %: joint_256 (+5.00 [+2.73, +7.27] over it)." in page.text
+def test_training_and_diagnostics_are_drawn_and_every_seed(page):
+    names = {name.removeprefix("Catch: ") for name in page.pictures}
+    assert {
+        "return in training",
+        "loss: rl",
+        "effective rank",
+        "CKA with the last latents",
+        "diag/new",
+    } < names
+    assert {f"{arm}, each seed" for arm, _ in CURVES} < names
+    assert "Without diagnostics: Catch / joint / seed 0, Catch / joint / seed 1" in page.text
 
 
-def test_the_sentences_say_what_the_intervals_say(tmp_path):
-    # Areas: rl 0, 0.25, 0.5; above 1, three times; near 0, 0.25, 0.75. The standard error of rl's mean is
-    # 0.25 / sqrt(3), t of two degrees of freedom 4.303, and those of its difference from above are the same.
-    ends = {"rl": [0.0, 0.5, 1.0], "near": [0.0, 0.5, 1.5], "above": [2.0, 2.0, 2.0]}
-    for arm, values in ends.items():
-        mode = "rl_only" if arm == "rl" else "joint"
-        for seed, value in enumerate(values):
-            write_run(tmp_path / arm / f"seed{seed}", [0.0, value / 2, value], seed=seed, mode=mode)
-    page = Page(build(tmp_path, media=False))
-    assert (
-        "rl has 0.25 [−0.37, 0.87]. Above it, by Welch's t test at 5 %: above (+0.75 [+0.13, +1.37] over it)."
-        in (page.text)
-    )
-    assert "Not told apart from it: near." in page.text and "Too few" not in page.text
-    table = page.table("Statistics of Catch")
-    assert "▲" in table["above"][4] and "▲" not in table["near"][4]
-
-
-def test_a_performance_profile_by_hand():
-    from experiments.reporting import numbers
-
-    # In Catch 0 is a miss, -1, and 1 a catch, 1: these end at 0.5 and 1, and at 0.
-    ends = {"rl": [[-1.0, 0.0], [-1.0, 1.0]], "joint": [[-1.0, -1.0]]}
-    steps = np.array([0, 100])
-    comparison = numbers.Comparison(steps, {arm: np.array(x) for arm, x in ends.items()}, None)
-    games, thresholds, found = numbers.profiles({"Catch": comparison, "Pong": None}, ["rl", "joint", "other"])
-    assert games == ["Catch"] and thresholds[0] < 0 and thresholds[-1] == 1.0
-    rl, joint = found["rl"], found["joint"]
-    np.testing.assert_array_equal(rl.point, np.where(thresholds < 0.5, 1.0, 0.5 * (thresholds < 1.0)))
-    np.testing.assert_array_equal(joint.point, thresholds < 0)
-    assert np.isnan(joint.low).all() and list(found) == ["rl", "joint"]
-    # Two runs are drawn again as either one twice, or as both.
-    between = (thresholds > 0.5) & (thresholds < 1)
-    assert (rl.low[between] == 0).all() and (rl.high[between] == 1).all()
-
-
-def test_cost_and_settings(page):
+def test_cost_settings_and_protocol(page):
+    labels = [plots.steps_label(game) for game in ("Pong", "CatchDistractor", "")]
+    assert labels == ["env steps (4 frames each)", "env steps", "env steps"]
     cost = page.table("Time and cost of each arm")
     assert cost["Catch / rl"] == ["2", "4.0 h", "2.0 h", "100", "1.00 times"]
     assert cost["Catch / joint"][-2:] == ["50", "2.00 times"]
-    settings = page.table("Settings on Catch")
-    assert settings["field"] == ["rl", "joint", ODD]
-    assert settings["mode"] == ["rl_only", "joint", "rl_only"]
+    settings = page.table("Settings in which arms differ")
+    assert settings["field"] == ["rl", "joint", ODD] and settings["mode"] == ["rl_only", "joint", "rl_only"]
     assert settings["objectives reconstruction: weight"] == ["–", "2", "–"]
     assert set(settings) == {"field", "mode", "objectives", "objectives reconstruction: weight", "steps"}
-
-
-def test_diagnostics_are_drawn_and_missing_ones_said(page):
-    pictures = [attributes["alt"] for tag, attributes in page.attributes if tag == "img"]
-    names = {name.removeprefix("Catch: ") for name in pictures}
-    assert {"effective rank", "CKA with the oldest latents", "CKA with the last latents", "new"} < names
-    without = "Without diagnostics: Catch / joint / seed 0, Catch / joint / seed 1, Catch / rl / seed 0 and"
-    assert without in page.text
-
-
-def test_the_same_runs_give_the_same_bytes(runs, text, tmp_path):
-    shutil.copytree(runs, tmp_path / "runs")  # with other times of its files
-    assert build(tmp_path / "runs", baseline="rl") == text
-
-
-def test_a_page_of_runs_of_before(tmp_path):
-    # No pictures, no diagnostics, one seed, and of one arm a run that has just begun.
-    write_run(tmp_path / "a/seed0", [0.0, 1.0, 1.0])
-    write_run(tmp_path / "b/seed0", [-1.0], mode="joint")
-    write_run(tmp_path / "pretrain/seed0", mode="pretrain")
-    page = Page(build(tmp_path, media=False))
-    assert "These runs have no diagnostics" in page.text and "--nomedia" in page.text
-    assert list(page.table("Statistics of Catch")) == ["arm", "a", "random policy", "no-op policy"]
-    assert "Catch / b / seed 0: 200 of 200 env steps" in page.text  # it lacks evaluations
-    assert [a["alt"] for tag, a in page.attributes if tag == "img"] == ["Catch: learning curves"]
-    assert "pretrain" in page.table("Settings on Catch")["field"]
-
-
-def test_what_only_atari_has_is_said_of_atari_alone(tmp_path):
-    from experiments.reporting.configs import protocol_text
-
-    catch, pong = (protocol_text(Config(game=game, frame_size=84)) for game in ("Catch", "Pong"))
+    catch, pong = (configs.protocol_text(Config(game=game, frame_size=84)) for game in ("Catch", "Pong"))
     assert catch == (
         "10 full games an evaluation, every 100,000 env steps; epsilon 0.005; at most 27,000 env steps a game"
     )
     assert pong == catch.replace(
         "; at most", "; no sticky actions; fewer than 30 no-ops at the start; at most"
     ) + (", of 4 frames each; in training, a lost life ends the return")
-    labels = [plots.steps_label(game) for game in ("Pong", "CatchDistractor", "")]
-    assert labels == ["env steps (4 frames each)", "env steps", "env steps"]
 
 
-def test_a_game_without_scores_of_others_has_numbers_of_its_own(tmp_path):
+def test_the_same_runs_give_the_same_bytes_and_the_rows_are_beside_them(runs, text, tmp_path, capsys):
+    shutil.copytree(runs, tmp_path / "runs")  # with other times of its files
+    shutil.copy(runs.parent / "secret.png", tmp_path)
+    out = tmp_path / "made/report.html"
+    assert report.report(parsed(tmp_path / "runs", f"--out={out}", "--baseline=rl")) == out
+    assert out.read_text() == text and {p.name for p in out.parent.iterdir()} == {"report.html", "report.csv"}
+    rows = list(csv.DictReader(io.StringIO((out.parent / "report.csv").read_text())))
+    assert len(rows) == sum(len(returns) + 2 for returns in CURVES.values())
+    row = next(
+        x for x in rows if (x["arm"], x["seed"], x["kind"], x["env_step"]) == ("joint", "0", "eval", "300")
+    )
+    assert row["game"] == "Catch" and row["eval/return_mean"] == "5.0" and row["loss/rl"] == ""
+    assert "diag/drift/cka" not in row and "env_steps" not in row
+    with pytest.raises(ConfigError, match="report.html exists; .*--overwrite"):
+        report.report(parsed(f"--out={out}", f"--runs={runs}"))
+    out.unlink()
+    with pytest.raises(ConfigError, match="report.csv exists; .*--overwrite"):
+        report.report(parsed(f"--out={out}", f"--runs={runs}"))
+
+
+@pytest.fixture(scope="module")
+def two_games(tmp_path_factory):
+    """Three seeds on two games; on Catch three arms, on the other one two. Some have failed or just begun."""
+    root = tmp_path_factory.mktemp("two") / "runs"
+    # Areas: rl 0, 0.25, 0.5; above 1, three times; near 0, 0.25, 0.75. The standard error of rl's mean is
+    # 0.25 / sqrt(3), t of two degrees of freedom 4.303, and those of its difference from above are the same.
+    ends = {"rl": [0.0, 0.5, 1.0], "near": [0.0, 0.5, 1.5], "above": [2.0, 2.0, 2.0]}
+    for game in ("Catch", "CatchDistractor"):
+        for arm, values in ends.items():
+            mode = {"mode": "rl_only" if arm == "rl" else "joint", "game": game}
+            for seed, value in enumerate(values):
+                write_run(root / game / arm / f"seed{seed}", [0.0, value / 2, value], seed=seed, **mode)
+    # It would be the baseline, as its name sorts first.
+    ending.write(write_run(root / "Catch/bad/seed0", [0.0, 9.0]), NOT_FINITE)
+    ending.write(write_run(root / "Catch/rl/seed3", [0.0, 1.0], seed=3), NOT_FINITE)
+    write_run(root / "Catch/begun/seed0", [-1.0], mode="joint")
+    write_run(root / "Catch/pretrain/seed0", mode="pretrain")
+    return root
+
+
+def test_the_sentences_say_what_the_intervals_say(two_games):
+    page = Page(build(two_games, media=False))
+    sentence = "rl has 0.25 [−0.37, 0.87]. Better: above (+0.75 over 0.25). Not told apart: near."
+    assert page.text.count(sentence) == 2
+    table = page.table("Statistics of Catch")
+    assert table["above"][4] == "+0.75 over 0.25 ▲ [+0.13, +1.37]" and "▲" not in table["near"][4]
+    assert list(table) == ["arm", "rl", "above", "near", "random policy", "no-op policy"]
+    # Over games nothing is concluded from a bootstrap that is too narrow.
+    over = page.table("The return at the end, over games")["above"]
+    assert over[0].endswith("too narrow") and "▲" not in over[-1]
+    # Those that failed or have just begun are named, and cut nothing.
+    assert (
+        f"Failed, not compared: Catch / bad / seed 0: {NOT_FINITE.reason} Catch / rl / seed 3:" in page.text
+    )
+    bad, rl = (
+        f"{x} seed{y} left out: {NOT_FINITE.reason} (seed {z})"
+        for x, y, z in (("bad: 1 of 1", "", 0), ("rl: 1 of 4", "s", 3))
+    )
+    begun = "begun: 1 of 1 seed left out: has only begun (seed 0)"
+    assert f"Not compared: {rl} {bad} {begun}" in page.text
+    assert "Catch / begun / seed 0: 200 of 200 env steps" in page.text  # it lacks evaluations
+    assert page.table("Every run")["Catch / bad / seed 0"][1] == "failed"
+    assert (
+        "pretrain" in page.table("Settings in which arms differ")["field"] and "policy" not in page.pictures
+    )
+
+
+def test_pages_of_few_runs(tmp_path, monkeypatch):
     game = "gymnasium:id=A-v0,grey=true,render=false,frame_skip=1,max_steps=0"
     for arm in "ab":
         for seed in range(2):
-            write_run(tmp_path / f"x/{arm}/seed{seed}", (1.0, 2.0 + seed), seed=seed, game=game, gamma=0.9)
-    page = Page(build(tmp_path, media=False))
+            write_run(tmp_path / f"own/{arm}/seed{seed}", (1.0, 2.0 + seed), seed=seed, game=game, gamma=0.9)
+    page = Page(build(tmp_path / "own"))
     assert list(page.table(f"Statistics of {game}")) == ["arm", "a", "b"]
     assert "No game with reference scores has runs of every arm" in page.text
+    ending.write(write_run(tmp_path / "failed/a/seed0", [0.0]), NOT_FINITE)
+    page = Page(build(tmp_path / "failed"))
+    assert "there is nothing to compare" in page.text and f"left out: {NOT_FINITE.reason}" in page.text
+    # Several directories, which are named as they are and not by where they lie.
+    write_run(tmp_path / "one/fast_seed0", [0.0, 1.0])
+    write_run(tmp_path / "two/runs/slow", [0.0, 0.5], mode="joint", objectives=("reconstruction",))
+    page = Page(build(tmp_path / "one", tmp_path / "two/runs/slow"))
+    assert list(page.table("Statistics of Catch"))[:3] == ["arm", "fast", "slow"]
+    places = {name: row[-1] for name, row in page.table("Every run").items()}
+    assert places["Catch / fast / seed 0"] == "one/fast_seed0" and places["Catch / slow / seed 0"] == "slow"
+    monkeypatch.chdir(tmp_path / "two/runs/slow")
+    page = Page(build(".."))
+    assert page.table("Every run")["Catch / slow / seed 0"][-1] == "slow" and "Below runs." in page.text
+    assert str(tmp_path) not in page.text
 
 
 def test_other_protocols_are_refused_or_said(tmp_path):
@@ -335,7 +370,7 @@ def test_other_protocols_are_refused_or_said(tmp_path):
     write_run(tmp_path / "b/seed0", [0.0, 1.0], sticky_actions=0.25)
     with pytest.raises(ConfigError, match="sticky_actions is 0.0 there and 0.25 here; --force"):
         build(tmp_path)
-    page = Page(build(tmp_path, force=True, media=False))
+    page = Page(build(tmp_path, force=True))
     assert "Compared by force (--force), though these differ:" in page.text
     assert "sticky_actions is 0.0 there and 0.25 here" in page.text and "gamma is 0.99" in page.text
     shutil.rmtree(tmp_path / "b")
@@ -343,20 +378,13 @@ def test_other_protocols_are_refused_or_said(tmp_path):
         build(tmp_path)
 
 
-def test_what_is_asked_for_must_be_there(runs):
-    with pytest.raises(
-        ConfigError, match="--baseline=other: not an arm with a policy; valid: <b>.*joint, rl"
-    ):
-        build(runs, baseline="other")
-    with pytest.raises(ConfigError, match="--reach=Pong: no run of that game; valid: Catch"):
-        build(runs, reach={"Pong": 1.0})
-
-
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
         ("figures/a.png", b"no picture", "a.png: neither a PNG nor a GIF"),
-        ("figures/reconstruction.json", b"[1]", "reconstruction.json: not a JSON object"),
+        ("figures/other.json", b"[1]", "other.json: not a JSON object"),
+        ("figures/other.json", b"{", "other.json: not JSON"),
+        ("README.md", b"\xff", "README.md: .*utf-8"),
         ("Catch/rl/seed0/figures/play.gif", b"<svg>", "play.gif: neither"),
         ("Catch/rl/seed0/config.json", b'{"versions": 1}', "config.json"),
         (
@@ -366,7 +394,9 @@ def test_what_is_asked_for_must_be_there(runs):
         ),
     ],
 )
-def test_what_is_not_what_training_writes_is_named(runs, tmp_path, file, content, message):
+def test_what_is_not_what_training_writes_is_named(runs, tmp_path, monkeypatch, file, content, message):
+    monkeypatch.setattr(gallery, "learning_curves", lambda *_: {"means": [], "seeds": []})
+    monkeypatch.setattr(gallery, "measured", lambda *_: [])
     shutil.copytree(runs, tmp_path / "runs")
     (tmp_path / "runs" / file).write_bytes(content)
     with pytest.raises(ConfigError, match=message):
@@ -374,52 +404,95 @@ def test_what_is_not_what_training_writes_is_named(runs, tmp_path, file, content
 
 
 def test_whether_a_run_is_finished():
-    from experiments.reporting.numbers import finished
-
     def run(evals, trains, **values):
         rows = [{"kind": "eval", "env_steps": step, "eval/return_mean": 1.0} for step in evals]
         rows += [{"kind": "train", "env_steps": step} for step in trains]
         return RunData("", "Catch", "a", 0, Config(steps=250, eval_every=100, log_every=50, **values), rows)
 
-    assert finished(run([0, 100, 200], [50, 100, 150, 200, 250]))
-    assert not finished(run([0, 100, 200], [50, 100, 150, 200]))  # the last row of training is missing
-    assert not finished(run([0, 100], [250]))  # the last evaluation is
-    assert finished(run([0, 100], [100], stop_at_return=1.0))
-    assert finished(run([], [250], mode="pretrain"))
+    assert numbers.finished(run([0, 100, 200], [50, 100, 150, 200, 250]))
+    assert not numbers.finished(
+        run([0, 100, 200], [50, 100, 150, 200])
+    )  # the last row of training is missing
+    assert not numbers.finished(run([0, 100], [250]))  # the last evaluation is
+    assert numbers.finished(run([0, 100], [100], stop_at_return=1.0))
+    assert numbers.finished(run([], [250], mode="pretrain"))
 
 
-@pytest.mark.parametrize(("arms", "sizes"), [(6, [6]), (7, [4, 4]), (14, [6, 6, 4])])
-def test_arms_are_drawn_in_groups_with_the_baseline(arms, sizes):
-    from experiments.reporting.gallery import groups
-
-    names = [f"arm{i}" for i in range(arms)]
-    found = groups(names, "arm3")
-    assert [len(group) for group in found] == sizes
-    assert all("arm3" in group for group in found) and set(sum(found, [])) == set(names)
+def test_a_performance_profile_by_hand():
+    # In Catch 0 is a miss, -1, and 1 a catch, 1: these end at 0.5 and 1, and at 0.
+    ends = {"rl": [[-1.0, 0.0], [-1.0, 1.0]], "joint": [[-1.0, -1.0]]}
+    comparison = numbers.Comparison(np.array([0, 100]), {arm: np.array(x) for arm, x in ends.items()}, None)
+    games, thresholds, found = numbers.profiles({"Catch": comparison})
+    assert games == ["Catch"] and thresholds[0] < 0 and thresholds[-1] == 1.0
+    rl, joint = found["rl"], found["joint"]
+    np.testing.assert_array_equal(rl.point, np.where(thresholds < 0.5, 1.0, 0.5 * (thresholds < 1.0)))
+    np.testing.assert_array_equal(joint.point, thresholds < 0)
+    # Two runs are drawn again as either one twice, or as both.
+    between = (thresholds > 0.5) & (thresholds < 1)
+    assert np.isnan(joint.low).all() and (rl.low[between] == 0).all() and (rl.high[between] == 1).all()
 
 
 @pytest.mark.parametrize("noise", [False, True])
 def test_large_pictures_are_made_smaller(tmp_path, noise):
-    import base64
-    import io
-
-    from PIL import Image
-
-    from experiments.reporting import pictures
-
     rng = np.random.default_rng(0)
-    shape = (40, 42, 42, 1)
+    shape = (40, 42, 42, 3)
     frames = rng.integers(0, 256, shape, dtype=np.uint8) if noise else np.zeros(shape, np.uint8)
-    path = plots.gif(frames, tmp_path / "play.gif", scale=2)
-    limit = 25_000 if noise else path.stat().st_size
+    frames[1] = frames[0]
+    path = images.gif(frames, tmp_path / "play.gif", scale=2)
+    limit = 50_000 if noise else path.stat().st_size
     found = pictures.taken(path, limit)
-    with Image.open(io.BytesIO(base64.b64decode(found.source.partition(",")[2]))) as image:
-        assert found.bytes <= limit and image.size == ((42, 42) if noise else (84, 84))
-        # Every second frame, for twice as long each, and the first ones of these.
-        if noise:
-            assert image.info["duration"] == 140 and 5 < image.n_frames < 20
-            np.testing.assert_array_equal(np.asarray(image.convert("L")), frames[0, ..., 0])
+    with opened(found) as image:
+        assert found.bytes <= limit and image.size == (84, 84)
+        if noise:  # the first frames, in colour and as fast; the first of them is there twice
+            assert image.info["duration"] == 140 and 1 < image.n_frames < 20
+            shown = np.asarray(image.convert("RGB"))[::2, ::2].astype(int)
+            assert np.abs(shown - frames[0]).mean() < 20  # of 256 colours; a grey one is 50 off
     assert pictures.taken(tmp_path / "none.gif", limit) is None
+
+
+def test_many_pictures_are_made_smaller_still(tmp_path, monkeypatch):
+    image = np.random.default_rng(0).random((6, 42, 42, 1), np.float32)
+    run = collect.load_run(write_run(tmp_path / "rl/seed0", [0.0]))
+    images.image_panel(image, image, image[::-1], run.path / "figures/reconstruction.png", "")
+    shutil.copy(
+        run.path / "figures/reconstruction.png", run.path / "figures/losses.png"
+    )  # which a report draws
+    monkeypatch.setattr(gallery, "LARGEST_PICTURE", 20_000)
+    games = [numbers.Game("Catch", {"rl": [run]}, True, None)]
+    (shown,) = gallery.own_pictures(games)["Catch"]["png"]
+    with opened(shown.picture) as image:
+        assert image.format == "WEBP" and image.width == pictures.COLUMN
+    larger = (run.path / "figures/reconstruction.png").stat().st_size
+    assert shown.picture.bytes < larger / 1.5 and shown.picture.size == image.size
+
+
+def opened(picture):
+    return Image.open(io.BytesIO(base64.b64decode(picture.source.partition(",")[2])))
+
+
+@pytest.mark.parametrize(("arms", "sizes"), [(0, [0]), (1, [1]), (6, [6]), (7, [4, 4]), (14, [6, 6, 4])])
+def test_arms_are_drawn_in_groups_with_the_baseline(arms, sizes):
+    names = [f"arm{i}" for i in range(arms)]
+    found = gallery.groups(names, "arm3")
+    assert [len(group) for group in found] == sizes and set(sum(found, [])) == set(names)
+    assert arms < 4 or all("arm3" in group for group in found)
+
+
+def test_what_a_run_went_on_under_is_said(tmp_path):
+    run = write_run(tmp_path / "run")
+    about = json.loads((run / "config.json").read_text())
+    changed = {"jax": "1.3", "git_revision": "fedcba9876543210-dirty", "cpus": 8}
+    about["continued"] = [{"env_steps": 100, "changed": changed}]
+    (run / "config.json").write_text(json.dumps(about))
+    found = configs.about(collect.load_run(run))
+    assert found["jax"] == "1.2.3, then 1.3" and found["cpus"] == "none, then 8"
+    assert found["git_revision"] == "0123456789, then fedcba9876-dirty"
+
+
+def test_arms_are_in_the_order_of_their_numbers(tmp_path):
+    for arm in ("weight10", "weight9", "weight100", "joint_50"):
+        write_run(tmp_path / arm / "seed0", [0.0])
+    assert numbers.arms_of(collect.load_runs(tmp_path)) == ["joint_50", "weight9", "weight10", "weight100"]
 
 
 def parsed(*arguments):
@@ -429,23 +502,23 @@ def parsed(*arguments):
     return values
 
 
-def test_the_command_line(runs, tmp_path, capsys):
-    out = tmp_path / "made/report.html"
-    assert report.report(parsed(runs, f"--out={out}", "--nomedia", "--baseline=rl")) == out
-    written = out.read_text()
-    assert written.startswith("<!doctype html>") and [p.name for p in out.parent.iterdir()] == ["report.html"]
-    with pytest.raises(ConfigError, match="exists; .*--overwrite"):
-        report.report(parsed(f"--out={out}", f"--runs={runs}"))
-    assert parsed(f"--out={out}", runs)["runs"].value == [str(runs)]
-    assert parsed("a", f"--out={out}", "b")["runs"].value == ["a", "b"]
+def test_the_command_line(monkeypatch, tmp_path, capsys):
+    assert parsed("a", "--out=x.html", "b")["runs"].value == ["a", "b"]
     assert parsed("--runs=a", "--runs=b")["runs"].value == ["a", "b"]
     for wrong, message in (
-        ([f"--runs={runs}", runs], "unexpected argument"),
-        ([runs, "--ovewrite"], "did you mean --overwrite"),
+        (["--runs=a", "a"], "unexpected argument"),
+        (["a", "--ovewrite"], "did you mean --overwrite"),
     ):
         with pytest.raises(SystemExit) as ended:
             parsed(*wrong)
         assert ended.value.code == 2 and message in capsys.readouterr().err
+    assert report.check_reach(["Pong=-3", "gymnasium:id=A-v0=1"]) == {"Pong": -3.0, "gymnasium:id=A-v0": 1.0}
+    find = report.importlib.util.find_spec
+    monkeypatch.setattr(
+        report.importlib.util, "find_spec", lambda name: None if name == "jinja2" else find(name)
+    )
+    with pytest.raises(ConfigError, match=r"needs Jinja2: pip install 'srl-jax\[plots\]'"):
+        report.report(parsed(tmp_path, f"--out={tmp_path}/x.html"))
 
 
 @pytest.mark.parametrize(
@@ -461,93 +534,16 @@ def test_the_command_line(runs, tmp_path, capsys):
         ([".", "--out=a.html"], "no run directory"),
         ([".", "--out=a.html", "--reach=Pong"], "must be GAME=SCORE"),
         ([".", "--out=a.html", "--reach=Pong=nan"], "must be GAME=SCORE"),
+        (["{runs}", "--out=a.html", "--reach=Pong=1"], "--reach=Pong: no run of that game; valid: Catch"),
+        (
+            ["{runs}", "--out=a.html", "--baseline=x"],
+            "--baseline=x: not an arm with a policy; valid: <b>.*joint, rl",
+        ),
     ],
 )
-def test_what_is_refused_leaves_nothing(tmp_path, monkeypatch, arguments, message):
+def test_what_is_refused_leaves_nothing(runs, tmp_path, monkeypatch, arguments, message):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match=message):
-        report.report(parsed(*arguments))
+        report.report(parsed(*(argument.format(runs=runs) for argument in arguments)))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-@pytest.mark.skipif(not browser.installed(), reason="needs chromium and chromedriver")
-def test_in_a_browser(runs, text, tmp_path):
-    path = tmp_path / "report.html"
-    path.write_text(text)
-    desktop, phone = browser.render(path)
-    assert (desktop.width, phone.width) == (1280, 390) and desktop.images[0] == 10
-    assert browser.problems(desktop) == browser.problems(phone) == []
-    # What it is to find, it finds.
-    wide = '<div style="width: 2000px">x</div><img src="http://127.0.0.1:9/x.png"><script>x()</script>'
-    path.write_text(f"<!doctype html><title>x</title>{wide}")
-    (found,) = browser.render(path, [390])
-    lines = " ".join(browser.problems(found))
-    assert "wide: <div" in lines and "asks for http://127" in lines and "x is not defined" in lines
-
-
-def test_seeds_that_failed_are_named_and_cut_nothing(tmp_path):
-    diag = {"diag/effective_rank": [1.0, 2.0, 3.0]}
-    for seed in (0, 1):
-        write_run(tmp_path / f"rl/seed{seed}", [0.0, 1.0, 1.0], seed=seed, diag=diag)
-        # It would be the baseline, as its name sorts first.
-        ending.write(write_run(tmp_path / f"bad/seed{seed}", [0.0, 9.0], seed=seed), NOT_FINITE)
-    half = {"mode": "joint", "objectives": ("reconstruction",)}
-    write_run(tmp_path / "half/seed0", [0.0, 1.0, 2.0], diag=diag, **half)
-    ending.write(write_run(tmp_path / "half/seed1", [0.0, 1.0], diag=diag, seed=1, **half), NOT_FINITE)
-    page = Page(build(tmp_path, media=False))
-    assert list(page.table("Statistics of Catch")) == ["arm", "rl", "half", "random policy", "no-op policy"]
-    assert page.table("Statistics of Catch")["half"][1] == "2.00 (no interval)"
-    text = f"Failed, not compared:Catch / bad / seed 0: {NOT_FINITE.reason} Catch / bad / seed 1:"
-    assert text in page.text and "Not finished" not in page.text and "3 of 6 runs" in page.text
-    bad = f"bad: 2 of 2 seeds left out: {NOT_FINITE.reason} (seed 0, 1)"
-    half = f"half: 1 of 2 seeds left out: {NOT_FINITE.reason} (seed 1)"
-    assert f"Not compared:{bad} {half}" in page.text
-    assert f"Catch, {half}." in page.text and f"Catch, {bad}." in page.text  # beside the curves
-    assert page.table("Every run")["Catch / bad / seed 0"][1] == "failed"
-    assert "rl (2 seeds) half (1 seed)" in page.text
-
-
-def test_a_page_of_runs_that_all_failed(tmp_path):
-    ending.write(write_run(tmp_path / "a/seed0", [0.0]), NOT_FINITE)
-    page = Page(build(tmp_path, media=False))
-    assert f"Not compared:a: 1 of 1 seed left out: {NOT_FINITE.reason}" in page.text
-
-
-def test_an_encoder_is_from_an_arm_though_its_run_is_a_link(tmp_path):
-    from experiments.collect import load_runs
-    from experiments.reporting import numbers
-
-    write_run(tmp_path / "disk/Catch/source/seed0", mode="pretrain")
-    write_run(
-        tmp_path / "cmp/frozen_seed0", [0.0], mode="frozen", encoder_from="/gone/disk/Catch/source/seed0"
-    )
-    (tmp_path / "cmp/mine_seed0").symlink_to(tmp_path / "disk/Catch/source/seed0")
-    runs = load_runs(tmp_path / "cmp")
-    assert {cost.arm: cost.source for cost in numbers.costs(runs, ["frozen", "mine"], None)} == {
-        "frozen": "mine",
-        "mine": "",
-    }
-
-
-def test_runs_of_several_directories_are_on_one_page(tmp_path, monkeypatch):
-    write_run(tmp_path / "one/fast_seed0", [0.0, 1.0])
-    write_run(tmp_path / "two/runs/slow", [0.0, 0.5], mode="joint", objectives=("reconstruction",))
-    page = Page(build(tmp_path / "one", tmp_path / "two/runs/slow", media=False))
-    assert list(page.table("Statistics of Catch")) == ["arm", "fast", "slow", "random policy", "no-op policy"]
-    places = {name: row[-1] for name, row in page.table("Every run").items()}
-    assert places["Catch / fast / seed 0"] == "one/fast_seed0" and places["Catch / slow / seed 0"] == "slow"
-    assert "one, slow" in page.text and str(tmp_path) not in page.text
-    monkeypatch.chdir(tmp_path / "two/runs/slow")
-    page = Page(build("..", media=False))
-    assert page.table("Every run")["Catch / slow / seed 0"][-1] == "slow"
-    assert "Directory runs" in page.text
-
-
-def test_arms_are_in_the_order_of_their_numbers(tmp_path):
-    from experiments.collect import load_runs
-    from experiments.reporting import numbers
-
-    for arm in ("weight10", "weight9", "weight100", "joint_50"):
-        write_run(tmp_path / arm / "seed0", [0.0])
-    assert numbers.arms_of(load_runs(tmp_path)) == ["joint_50", "weight9", "weight10", "weight100"]

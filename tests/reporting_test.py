@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from srl_jax import reporting
+from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.metrics import read_metrics, strip_wall
 from srl_jax.optim import NOT_MEASURED
@@ -100,7 +101,7 @@ def test_snapshots_of_means_are_exact():
 
 def report(out):
     out.mkdir(exist_ok=True)
-    return Report(out, 1000, progress=False, tensorboard=False)
+    return Report(out, Config(steps=1000), progress=False)
 
 
 def go_on(one, first, last):
@@ -134,7 +135,7 @@ def test_rows_after_a_snapshot_are_those_that_would_have_been(tmp_path, stop, la
     with open(tmp_path / "killed" / "metrics.jsonl", "ab") as file:
         file.write(b'{"kind": "tr')
     again = report(tmp_path / "killed")
-    again.restore(snapshot, 10 * stop)
+    again.restore(snapshot)
     with again:
         go_on(again, stop, 24)
     rows = stripped(tmp_path / "killed")
@@ -156,7 +157,7 @@ def test_the_clock_goes_on_where_it_was(tmp_path, monkeypatch):
         snapshot = first.snapshot()
     now[0] = 5000.0  # another process, another clock
     second = report(tmp_path / "run")
-    second.restore(snapshot, 500)
+    second.restore(snapshot)
     with second:
         assert second.seconds == 10
         now[0] += 3
@@ -185,7 +186,7 @@ def test_metrics_that_the_checkpoint_does_not_know_are_left_alone(tmp_path, chan
     if change == "directory":
         path.mkdir()
     second = report(tmp_path / "run")
-    second.restore(snapshot, 90)
+    second.restore(snapshot)
     with pytest.raises(ConfigError, match=f"{path}: .*the checkpoint knows") as error, second:
         pass
     assert "\n" not in str(error.value)

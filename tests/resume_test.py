@@ -61,7 +61,6 @@ def digests(run):
         if name != "report":  # whose rows are compared
             arrays, numbers[name] = snapshot()
             found |= {f"{name} {key}": x for key, x in arrays.items()}
-    numbers["play"].pop("evaluation_due")  # of the last checkpoint, not of now
     found = {name: hashlib.sha256(np.ascontiguousarray(x).tobytes()).hexdigest() for name, x in found.items()}
     return found | {name: json.dumps(x) for name, x in numbers.items()}
 
@@ -127,7 +126,11 @@ def test_a_run_that_is_stopped_and_goes_on_is_the_run_that_was_not(whole, tmp_pa
     stopped, _ = go(config, path, stops[0])
     for stop, now in zip(stops, [*stops[1:], None], strict=True):
         assert stopped.interrupted and stopped.env_steps == stop
-        assert checkpoint.read_manifest(path).env_steps == stop
+        manifest = checkpoint.read_manifest(path)
+        assert manifest.env_steps == stop
+        # Of an evaluation that began before: of 0 until the row of 40, of 60 until 80, 120 until 160, 180.
+        under_way = mode != "pretrain" and stop in (4, 36, 64, 76, 156, 196)
+        assert ("evaluating.msgpack" in manifest.files) == under_way
         stopped, end = resume(config, path, now)
     assert not stopped.interrupted
     assert {name for name in whole_end if end[name] != whole_end[name]} == set()
@@ -185,7 +188,7 @@ def test_a_return_that_ends_a_run_ends_it_all_the_same(tmp_path, monkeypatch, st
     monkeypatch.setattr(seed, "evaluate", better)
     config = make_config("rl_only", stop_at_return=0.5)
     result, whole_end = go(config, tmp_path / "whole")
-    assert result.env_steps == 160 and '"solved": true' in whole_end["play"] and not result.interrupted
+    assert result.env_steps == 160 and '"best": 1.0' in whole_end["play"] and not result.interrupted
     go(config, tmp_path / "run", stop)
     result, end = resume(config, tmp_path / "run")
     assert result.env_steps == 160 and end == whole_end
@@ -232,16 +235,17 @@ def test_chunks_of_frames_that_nothing_was_written_to_are_links(tmp_path, monkey
 
 OF_A_RUN = {
     "in the checkpoint": {"state", "env_steps", "updates", "seeds"},
-    "in metrics.jsonl before one is written": {"evaluating", "waiting"},
+    "in metrics.jsonl before one is written": {"waiting"},
     "of the configuration": {
         "config", "checkpoint_every", "agent", "device", "schedules", "act_keys", "stop",
     },
-    "of the process": {"env_threads", "eval_threads", "left", "resumed"},
+    "of the process": {"env_threads"},
 }  # fmt: skip
 OF_A_SEED = {
     "in parts": {
-        "replay", "env", "report", "stacks", "score", "rng", "recording", "best", "solved", "evaluation_due",
+        "replay", "env", "report", "stacks", "score", "rng", "recording", "best", "evaluating",
     },
+    "of the process": {"games", "eval_thread", "eval_env"},
     "the checkpoint itself": {"saved", "saved_position"},
     "of the configuration": {"config", "out", "agent", "key", "policy"},
     "in encoders/": {"diagnostics"},

@@ -1,19 +1,22 @@
 """Tests of experiments.runtime. None writes to the user's cache, and only the last one restarts anything."""
 
-import json
+import importlib.metadata
 import os
 import pathlib
 import subprocess
 import sys
-import types
 
 import pytest
+from absl import flags
 
 from experiments import evaluate, runtime, train
+from experiments import flags as config_flags
+from srl_jax.metrics import read_metrics, strip_wall
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 CACHE = pathlib.Path("/cache/xla")
-(YNN,) = runtime.XLA_FLAGS
+VERSION = ".".join(importlib.metadata.version("jaxlib").split(".")[:2])
+(YNN,) = runtime.XLA_FLAGS["0.10"]
 JAX_CACHE = {
     "JAX_COMPILATION_CACHE_DIR": "/cache/xla",
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
@@ -25,12 +28,8 @@ AT_START = runtime.MALLOC | runtime.BLAS
 
 
 def _wanted(env, encoder="nature", **given):
-    defaults = {"glibc": True, "gpu": False, "cache": CACHE, "cores": 2, "works": lambda flags: True}
+    defaults = {"glibc": True, "gpu": False, "cache": CACHE, "cores": 2, "jaxlib": "0.10.2"}
     return runtime.wanted(env, encoder, **(defaults | given))
-
-
-def _never(flags):
-    raise AssertionError("asked without need")
 
 
 def test_the_wanted_environment():
@@ -39,12 +38,12 @@ def test_the_wanted_environment():
     assert _wanted({}, "sac_ae:features=256") == everything | {"NPROC": "3"}
     assert _wanted({"NPROC": "1"}, "sac_ae") == everything
     assert _wanted({}, "sac_ae", gpu=True) == JAX_CACHE
-    assert _wanted(everything, works=_never) == {}
-    assert _wanted({}, "tiny", works=_never) == AT_START | JAX_CACHE
+    assert _wanted(everything) == {}
+    assert _wanted({}, "tiny") == AT_START | JAX_CACHE
     assert _wanted({}, glibc=False) == JAX_CACHE | {"XLA_FLAGS": YNN}
-    assert _wanted({}, gpu=True, works=_never) == JAX_CACHE
+    assert _wanted({}, gpu=True) == JAX_CACHE
     assert _wanted({}, cache=None) == AT_START | {"XLA_FLAGS": YNN}
-    assert _wanted({}, works=lambda flags: False) == AT_START | JAX_CACHE
+    assert _wanted({}, jaxlib="0.9.1") == AT_START | JAX_CACHE
 
 
 def test_an_encoder_that_nobody_has_measured_counts_as_large():
@@ -87,11 +86,8 @@ def test_what_the_user_has_set_stays():
     ],
 )
 def test_flags_are_added_to_those_that_are_there(present, want):
-    asked = []
-    env = {"XLA_FLAGS": present}
-    found = _wanted(env, glibc=False, cache=None, works=lambda flags: asked.append(flags) or True)
+    found = _wanted({"XLA_FLAGS": present}, glibc=False, cache=None)
     assert found == ({} if want is None else {"XLA_FLAGS": want})
-    assert asked == ([] if want is None else [want])  # the whole text is tried, not our part alone
 
 
 def test_a_gpu_is_one_that_jax_may_and_can_use(tmp_path, monkeypatch):
@@ -125,76 +121,12 @@ def test_the_cache_folder_is_the_users_alone(tmp_path, monkeypatch):
         assert runtime.cache_folder({"XDG_CACHE_HOME": relative}) == tmp_path / ".cache" / "srl_jax"
 
 
-@pytest.fixture
-def xla(monkeypatch):
-    """Stands in for the process that tries the flags; knows `YNN` and no other."""
-    calls = []
-
-    def run(command, env, timeout, **streams):
-        assert command[:2] == [sys.executable, "-c"] and timeout <= 60
-        assert set(streams.values()) == {subprocess.DEVNULL}
-        assert env["JAX_PLATFORMS"] == "cpu" and "JAX_COMPILATION_CACHE_DIR" not in env
-        calls.append(env["XLA_FLAGS"])
-        if "hang" in env["XLA_FLAGS"]:
-            raise subprocess.TimeoutExpired(command, timeout)
-        return types.SimpleNamespace(returncode=0 if env["XLA_FLAGS"] == YNN else -6)
-
-    monkeypatch.setattr(runtime.subprocess, "run", run)
-    return calls
-
-
-def test_an_unknown_flag_is_left_out_and_the_answer_remembered(tmp_path, xla, capsys, monkeypatch):
-    for _ in range(2):
-        assert runtime.remembered(YNN, tmp_path)
-        assert not runtime.remembered("--xla_bogus", tmp_path)
-    assert xla == [YNN, "--xla_bogus"]
-    assert capsys.readouterr().err.count("\n") == 2  # a line for each time that one was tried
-    assert [path.name for path in tmp_path.iterdir()] == ["runtime.json"]
-    # Another processor, or another jax, is asked anew, and the old answers stay.
-    monkeypatch.setattr(runtime, "machine", lambda: "another")
-    assert runtime.remembered(YNN, tmp_path)
-    monkeypatch.setattr(runtime.importlib.metadata, "version", lambda name: "9.9")
-    assert runtime.remembered(YNN, tmp_path)
-    assert len(xla) == 4
-    assert list(json.loads((tmp_path / "runtime.json").read_text()).values()) == [True, False, True, True]
-
-
-def test_no_answer_is_not_remembered(tmp_path, xla):
-    for _ in range(2):
-        assert not runtime.remembered("--xla_hang", tmp_path)
-    assert len(xla) == 2 and not list(tmp_path.iterdir())
-
-
-@pytest.mark.parametrize("content", [b"", b"{", b"[1]", b"null", b"\xff\xfe", b"[" * 100_000, b'{"a": "b"}'])
-def test_a_damaged_answer_is_asked_for_again(content, tmp_path, xla, capsys):
-    (tmp_path / "runtime.json").write_bytes(content)
-    for _ in range(2):
-        assert runtime.remembered(YNN, tmp_path)
-    assert xla == [YNN]
-    assert capsys.readouterr().err.count("\n") == 1
-
-
-def test_an_answer_must_be_true_or_false(tmp_path, xla):
-    runtime.remembered("--xla_bogus", tmp_path)
-    file = tmp_path / "runtime.json"
-    file.write_text(file.read_text().replace("false", '"yes"'))
-    assert not runtime.remembered("--xla_bogus", tmp_path)
-    assert len(xla) == 2
-
-
-def test_answers_that_cannot_be_kept_are_asked_for_each_time(tmp_path, xla, capsys):
-    (tmp_path / "runtime.json").mkdir()
-    for folder in (tmp_path, tmp_path / "missing", None):
-        assert runtime.remembered(YNN, folder)
-    assert xla == [YNN] * 3
-    assert capsys.readouterr().err.count("\n") == 3
-    assert [path.name for path in tmp_path.iterdir()] == ["runtime.json"]
-
-
-def test_xla_itself_is_asked(monkeypatch):
-    # Stops at the flags, before anything is compiled.
-    monkeypatch.setenv("JAX_PLATFORMS", "cpu")
-    assert runtime.probe("--xla_no_such_flag=1") is False
+def test_xla_takes_the_flags_of_its_version():
+    # XLA ends a process whose flags it does not know, so another one is asked.
+    xla = {"JAX_PLATFORMS": "cpu", "XLA_FLAGS": " ".join(runtime.XLA_FLAGS[VERSION])}
+    code = "import jax; jax.devices()"
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | xla, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 @pytest.fixture
@@ -204,7 +136,6 @@ def started(monkeypatch, tmp_path):
     monkeypatch.setattr(runtime.os, "execve", lambda *call: calls.append(call))
     monkeypatch.setattr(runtime, "has_glibc", lambda: True)
     monkeypatch.setattr(runtime, "has_gpu", lambda env: False)
-    monkeypatch.setattr(runtime, "remembered", lambda flags, folder: True)
     monkeypatch.setattr(sys, "orig_argv", ["python", "-X", "dev", "-m", "experiments.train", "--out=a b"])
     return calls
 
@@ -265,29 +196,18 @@ def test_off_leaves_everything(started, tmp_path, capsys):
     assert capsys.readouterr() == ("", "")
 
 
-def test_the_flag_is_a_flag_of_both_entry_points():
-    for module in (train, evaluate):
-        done = _entry_point(module.__name__, "--tune_runtime=x")
-        assert (done.returncode, done.stdout) == (2, "")
-        assert done.stderr == "error: --tune_runtime=x: valid: auto, off\n"
-
-
-def _entry_point(module, *arguments, **env):
-    present = {name: value for name, value in os.environ.items() if name not in (*AT_START, runtime.GUARD)}
-    return subprocess.run(
-        [sys.executable, "-m", module, *arguments],
-        cwd=ROOT,
-        env=present | env,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+@pytest.mark.parametrize("module", [train, evaluate])
+def test_the_flag_is_a_flag_of_both_entry_points(module, capsys):
+    values = flags.FlagValues()
+    module.define_flags(values)
+    with pytest.raises(SystemExit) as ended:
+        config_flags.parse(["program", "--tune_runtime=x"], values)
+    assert ended.value.code == 2
+    assert capsys.readouterr() == ("", "error: --tune_runtime=x: valid: auto, off\n")
 
 
 def _rows(run):
-    rows = [json.loads(line) for line in (run / "metrics.jsonl").read_text().splitlines()]
-    assert rows
-    return [{k: v for k, v in row.items() if not k.startswith("wall_")} for row in rows]
+    return [strip_wall(row) for row in read_metrics(run / "metrics.jsonl")]
 
 
 @pytest.mark.skipif(not runtime.has_glibc(), reason="only glibc's variables need a restart")
@@ -295,17 +215,25 @@ def test_training_restarts_once_and_learns_the_same(tmp_path):
     small = [
         "--game=Catch", "--frame_size=42", "--encoder=tiny", "--mode=pretrain", "--objective=latent_l2",
         "--num_envs=4", "--batch_size=4", "--learn_start=8", "--steps=40", "--log_every=20",
+        "--nodiagnostics",
     ]  # fmt: skip
-    env = {"XDG_CACHE_HOME": str(tmp_path / "cache"), "JAX_PLATFORMS": "cpu"}
-    lines = {}
-    for tune in ("auto", "off"):
-        arguments = [*small, f"--tune_runtime={tune}", f"--out={tmp_path / tune}"]
-        done = _entry_point("experiments.train", *arguments, **env)
-        assert done.returncode == 0, done.stderr
-        assert done.stdout.startswith("40 env steps, ")
-        lines[tune] = [line for line in done.stderr.splitlines() if line.startswith("runtime: ")]
-    assert lines["off"] == []
-    (line,) = lines["auto"]
+    present = {name: value for name, value in os.environ.items() if name not in (*AT_START, runtime.GUARD)}
+    done = subprocess.run(
+        [sys.executable, "-m", "experiments.train", *small, f"--out={tmp_path / 'auto'}"],
+        cwd=ROOT,
+        env=present | {"XDG_CACHE_HOME": str(tmp_path / "cache"), "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("40 env steps, ")
+    (line,) = (line for line in done.stderr.splitlines() if line.startswith("runtime: "))
     assert line.startswith("runtime: restarting with ") and len(line) < 100
+    # In this process nothing restarts.
+    values = flags.FlagValues()
+    train.define_flags(values)
+    config_flags.parse(["train", *small, f"--out={tmp_path / 'off'}"], values)
+    assert train.train(values) == 0
     assert "loss/latent_l2" in _rows(tmp_path / "auto")[-1]
     assert _rows(tmp_path / "auto") == _rows(tmp_path / "off")

@@ -1,23 +1,30 @@
-"""experiments/sweep.py and what runs its runs; training is played by tests/stub_run.py."""
+"""experiments/sweep.py and how its runs are run; training is played by tests/stub_run.py."""
 
+import concurrent.futures as cf
 import dataclasses
+import importlib.util
 import json
 import os
 import pathlib
+import pickle
 import signal
 import subprocess
 import sys
+import threading
 import time
 
+import numpy as np
 import pytest
 from absl import flags
 
 from experiments import flags as config_flags
-from experiments import sweep
-from experiments.sweeping import manifest, states, table
+from experiments import runtime, sweep
+from experiments.sweeping import launching, manifest, options, states, status
+from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
-from srl_jax import rundir
+from srl_jax import checkpoint, ending, rundir
 from srl_jax.config import Config
+from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
 
 STUB = pathlib.Path(__file__).with_name("stub_run.py")
@@ -25,16 +32,21 @@ CONFIG = Config(game="Catch", frame_size=42, steps=500, checkpoint_every=100, nu
 A, B, C = "Catch/a/seed0", "Catch/b/seed0", "Catch/c/seed0"
 
 
-def run(name, encoder_from=""):
-    return Planned(name, "catch/joint", {"game": "Catch", "seed": "0"}, encoder_from)
+def entry(name, encoder_from=""):
+    run = Planned(name, "catch/joint", {"game": "Catch", "seed": "0"}, encoder_from)
+    return Entry(run, dataclasses.replace(CONFIG, encoder_from=encoder_from))
 
 
-RUNS = [run(A), run(B), run(C, A)]
+ALL = {A: entry(A), B: entry(B), C: entry(C, A)}
 """Two, and one that starts from the first."""
 
 
-def resolve(runs):
-    return {r.name: dataclasses.replace(CONFIG, encoder_from=r.encoder_from) for r in runs}
+def complete(run, config, state=None):
+    """What a run leaves at its end."""
+    counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": 500, "updates": 1}
+    checkpoint.save(run, {"encoder": {"w": np.zeros(2)}}, config, state=state, **counts)
+    row = {"kind": "eval", "env_steps": 500, "updates": 1, "wall_s": 5.0, "eval/return_mean": 0.5}
+    (run / "metrics.jsonl").write_text(json.dumps(row) + "\n")
 
 
 class Sweep:
@@ -44,27 +56,39 @@ class Sweep:
         self.root = root
 
     def acts(self, **acts):
-        for r in RUNS:
-            path = self.root / "stub" / f"{r.name}.json"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            config = dataclasses.asdict(resolve([r])[r.name]) | {"versions": {}}
-            content = {"config": config, "acts": acts.get(r.name.split("/")[1], ["end"])}
-            path.write_text(json.dumps(content))
+        for name, (_, config) in ALL.items():
+            run = self.root / "stub" / f"{name}.run"
+            if not run.exists():
+                complete(run, config)
+            about = {"config": dataclasses.asdict(config) | {"versions": {}}}
+            about |= {"acts": acts.get(name.split("/")[1], ["end"])}
+            run.with_suffix(".json").write_text(json.dumps(about))
         return self
 
-    def run(self, runs=RUNS, **options):
-        options = {"workers": 2, "resolve": resolve, "command": self.command, **options}
-        return sweep.run_sweep(self.root, runs, **options)
+    def run(self, *names, **how):
+        entries = {name: ALL[name] for name in names or ALL}
+        return launching.run_sweep(self.root, entries, **{"workers": 2, "command": self.command, **how})
 
     def command(self, planned):
         return [sys.executable, "-S", "-E", str(STUB), str(self.root), planned.name]
 
-    def count(self, name, what="attempts"):
-        path = self.root / "stub" / f"{name}.{what}"
-        return len(path.read_text().splitlines()) if path.exists() else 0
+    def count(self, what="attempts"):
+        paths = [self.root / "stub" / f"{name}.{what}" for name in ALL]
+        return [len(path.read_text().splitlines()) if path.exists() else 0 for path in paths]
 
-    def record(self, name):
-        return states.read_record(self.root, name)
+    def seen(self):
+        return status.view(self.root, ALL)
+
+    def wait_for(self, name, attempts=1):
+        deadline, lock = time.monotonic() + 120, self.root / name / "lock"
+        while self.count()[list(ALL).index(name)] < attempts or not lock.exists() or not lock.read_text():
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(launching, "EVERY_S", 0.02)
 
 
 @pytest.fixture
@@ -73,134 +97,120 @@ def stubs(tmp_path):
 
 
 def test_runs_are_run_once_and_after_what_they_start_from(stubs, capsys):
-    outcome = stubs.run()
-    assert (sorted(outcome.done), outcome.failed, outcome.blocked, outcome.status) == ([A, B, C], {}, {}, 0)
+    assert stubs.run() == 0
     began = {}
-    for name in (A, B, C):
+    for name in ALL:
         in_root, began[name] = (stubs.root / "stub" / f"{name}.attempts").read_text().split()
         assert in_root == "True"
-    assert float(began[C]) > max(float(began[A]), float(began[B]) - 9)
-    assert stubs.record(C).status == 0 and stubs.record(C).ended >= stubs.record(A).ended
-    assert f"{C}: done, 500 env steps in 0:00:05, last evaluation 0.5" in capsys.readouterr().err
+    assert float(began[C]) > float(began[A])
+    said = capsys.readouterr().err
+    assert f"{C}: done, 500 env steps in 0:00:05, last evaluation 0.5" in said
+    assert said.endswith("sweep: 3 of 3 runs done\n")
     # Again: nothing is left to do.
     before = {p: p.read_bytes() for p in stubs.root.rglob("*") if p.is_file()}
-    assert sorted(stubs.run().done) == [A, B, C]
+    assert stubs.run() == 0
     assert {p: p.read_bytes() for p in stubs.root.rglob("*") if p.is_file()} == before
 
 
-def test_crashes_are_gone_on_with_and_errors_are_not(stubs, capsys):
-    stubs.acts(a=["kill", "exit:1", "end"], b=["exit:2"])
-    outcome = stubs.run(retries=2)
-    assert sorted(outcome.done) == [A, C] and outcome.status == 1
-    assert outcome.failed == {B: "ended on purpose 1"}
-    assert [stubs.count(name) for name in (A, B, C)] == [3, 1, 1]
-    assert f"{A}: killed by SIGKILL; resuming it" in capsys.readouterr().err
-    assert (stubs.record(A).attempts, stubs.record(B).status) == (3, 2)
+def test_crashes_are_resumed_and_what_starts_from_a_failed_run_is_blocked(stubs, capsys):
+    stubs.acts(a=["kill", "exit:1", "exit:7"], b=["exit:2"])
+    assert stubs.run(retries=2) == 1
+    assert stubs.count() == [3, 1, 0]
+    assert stubs.seen() == {
+        A: ("failed", "status 7: ended on purpose 3"),
+        B: ("failed", "ended on purpose 1"),  # bad input: no second attempt
+        C: ("blocked", f"{A} failed"),
+    }
+    said = capsys.readouterr().err
+    assert f"{A}: killed by SIGKILL; resuming it" in said and f"{C}: blocked: {A} failed" in said
+    # Given again, the command tries what is not complete, and what is wrong is forgotten until it is again.
+    stubs.acts(b=["", "wait", "end"])
+    thread = threading.Thread(target=stubs.run, kwargs={"retries": 0})
+    thread.start()
+    stubs.wait_for(B, 2)
+    assert stubs.seen()[B][0] == "running" and "failed" not in dict(stubs.seen().values())
+    (stubs.root / launching.STOP).unlink()  # also stops a sweep
+    thread.join()
+    assert stubs.seen()[B] == ("waiting", "") and stubs.run() == 0
 
 
-def test_what_starts_from_a_failed_run_is_blocked(stubs):
-    stubs.acts(a=["exit:1"], b=["exit:4"])
-    outcome = stubs.run(retries=1)
-    assert outcome.failed == {A: "status 1: ended on purpose 2", B: "ended on purpose 1"}
-    assert outcome.blocked == {C: f"{A} failed"}
-    assert [stubs.count(name) for name in (A, B, C)] == [2, 1, 0]
-    view = table.view_of_files(stubs.root, manifest.read(stubs.root))
-    assert (view.failed, view.blocked) == (outcome.failed, outcome.blocked)
-    # Started again, it tries what is not complete.
-    stubs.acts()
-    assert stubs.run().status == 0
-
-
-def test_a_full_disk_stops_the_sweep(stubs):
+def test_a_full_disk_stops_the_sweep(stubs, capsys):
     stubs.acts(a=["exit:3"], b=["wait"])
     with pytest.raises(SaveError, match=f"{A}: ended on purpose"):
         stubs.run()
-    # It was told to write a checkpoint and end, and has: before it heard of signals, or behind that.
-    assert stubs.record(B).status in (128 + signal.SIGTERM, -signal.SIGTERM)
+    # The other run was told to write a checkpoint and end, and has: before it heard of signals, or after.
     assert states.look(stubs.root / B, CONFIG).kind in ("missing", "resumable")
+    assert "stopping: Catch/a/seed0: ended on purpose 1; each run writes" in capsys.readouterr().err
 
 
-def test_a_run_that_ends_well_has_to_be_complete(stubs):
+@pytest.mark.parametrize("spoil", ["rows", "parameters"])
+def test_a_run_that_ends_well_has_to_be_complete(stubs, spoil):
+    assert stubs.run(B) == 0
+    if spoil == "rows":
+        (stubs.root / B / "metrics.jsonl").unlink()
+    else:
+        (stubs.root / B / "checkpoints/000000500/params.msgpack").write_bytes(b"12")
     stubs.acts(b=["lie"])
-    assert stubs.run([run(B)]).failed == {B: "ended with status 0 and is resumable"}
-    assert stubs.count(B) == 1
+    assert stubs.run(B) == 1 and stubs.count()[1] == 2
+    why = {"rows": "metrics.jsonl: No such file", "parameters": "params.msgpack has not the size"}[spoil]
+    assert stubs.seen()[B][1].startswith(f"ended with status 0 and is resumable {why}")
+
+
+def test_a_run_that_kept_its_replay_is_complete_once_it_has_finished(tmp_path):
+    complete(tmp_path, CONFIG, checkpoint.State({}, {}, {}))
+    CONFIG.save(tmp_path)
+    assert states.look(tmp_path, CONFIG) == ("resumable", 500, "")
+    ending.write(tmp_path, Ending("finished", 500))
+    assert states.look(tmp_path, CONFIG) == ("done", 500, "")
 
 
 def test_another_version_of_the_code_fails_its_run_and_not_the_sweep(stubs):
     """Runs are started with the code that lies there then, which somebody may have changed."""
-    stubs.acts(a=["slow"])
     path = stubs.root / "stub" / f"{A}.json"
     content = json.loads(path.read_text())
     content["config"]["new"] = 1
     path.write_text(json.dumps(content))
-    outcome = stubs.run()
-    assert "no field 'new'" in outcome.failed[A] and outcome.done == [B] and C in outcome.blocked
+    assert stubs.run() == 1
+    seen = stubs.seen()
+    assert "no field 'new'" in seen[A][1] and [seen[B][0], seen[C][0]] == ["done", "blocked"]
     with pytest.raises(ConfigError, match="no field 'new'"):  # and the next sweep says so at once
         stubs.run()
 
 
-def test_broken_directories_are_moved_aside_and_nothing_is_lost(stubs, capsys):
-    assert stubs.run().status == 0
-    for name, spoil in {
-        A: lambda run: (run / "config.json").write_text("{"),
-        B: lambda run: (run / "metrics.jsonl").unlink(),
-        C: lambda run: (run / "checkpoints/000000500/params.msgpack").write_bytes(b"12"),
-    }.items():
-        spoil(stubs.root / name)
-    (stubs.root / "Catch/a/seed0.broken-1").mkdir()
-    assert stubs.run().status == 0
-    assert [stubs.count(name, "ends") for name in (A, B, C)] == [2, 2, 2]
-    said = capsys.readouterr().err
-    assert "config.json: Expecting property name" in said and "moved aside to seed0.broken-2" in said
-    assert "metrics.jsonl: No such file" in said and "params.msgpack has not the size" in said
-    assert (stubs.root / "Catch/a/seed0.broken-2/config.json").read_text() == "{"
-    # One that got further than its first checkpoint, and has none.
-    rows = "".join(json.dumps({"env_steps": n}) + "\n" for n in (0, 104))
-    (stubs.root / B / "metrics.jsonl").write_text(rows)
-    checkpoints = stubs.root / B / "checkpoints"
-    (checkpoints / "000000500").rename(stubs.root / "gone")
-    config = resolve([run(B)])[B]
-    state = states.prepare(stubs.root / B, config, lambda line: None)
-    assert (
-        state.kind == "missing" and (stubs.root / "Catch/b/seed0.broken-2/metrics.jsonl").read_text() == rows
-    )
-
-
-def test_a_changed_plan_is_merged(stubs, capsys):
-    assert stubs.run([run(B)]).status == 0
-    assert stubs.run([run(A)]).done == [A]
+def test_a_changed_plan_is_merged(stubs):
+    assert stubs.run(B) == stubs.run(A) == 0
     assert list(manifest.read(stubs.root)) == [B, A]
-    assert [stubs.count(name) for name in (A, B)] == [1, 1]
+    assert stubs.count() == [1, 1, 0]
     before = (stubs.root / "sweep.json").read_bytes()
-
-    def longer(runs):
-        return {r.name: dataclasses.replace(CONFIG, steps=900) for r in runs}
-
+    longer = {B: entry(B)._replace(config=dataclasses.replace(CONFIG, steps=900))}
     with pytest.raises(ConfigError, match=r"b/seed0: .* steps is 500 there and 900 here; give the flags"):
-        stubs.run([run(B)], resolve=longer)
+        launching.run_sweep(stubs.root, longer)
+    with pytest.raises(ConfigError, match="a run directory; name another one"):
+        launching.run_sweep(stubs.root / B, longer)
     assert (stubs.root / "sweep.json").read_bytes() == before
-    with pytest.raises(ValueError, match="comes before"):
-        stubs.run([run(C, A), run(A)])
 
 
-def test_a_directory_that_somebody_writes_to_is_waited_for(stubs, capsys, monkeypatch):
-    (stubs.root / B).mkdir(parents=True)
-    other = subprocess.Popen(stubs.acts(b=["slow"]).command(run(B)), cwd=stubs.root)
-    while not (stubs.root / B / "config.json").exists():
-        time.sleep(0.01)
-    outcome = stubs.run([run(B)])
-    assert other.wait() == 0 and outcome.done == [B] and stubs.count(B) == 1
-    assert f"{B}: waiting: process " in capsys.readouterr().err or stubs.record(B) is None
+def test_a_directory_that_somebody_writes_to_is_waited_for(stubs, capsys):
+    other = subprocess.Popen(stubs.acts(b=["wait", "end"]).command(ALL[B].run), cwd=stubs.root)
+    stubs.wait_for(B)
+    thread, said = threading.Thread(target=stubs.run, args=[B]), ""
+    thread.start()
+    while f"{B}: waiting for process {other.pid} on here" not in said:
+        said += capsys.readouterr().err
+        assert thread.is_alive()
+    other.terminate()
+    thread.join()
+    assert stubs.count() == [0, 2, 0] and stubs.seen()[B][0] == "done" and other.wait() == 143
     with rundir.held(stubs.root), pytest.raises(ConfigError, match="is writing there"):
-        stubs.run([run(A)])
+        stubs.run(A)
 
 
 DRIVER = """
-import json, pathlib, sys
+import pathlib, sys
 sys.path.insert(0, sys.argv[1])
-from tests.sweep_test import RUNS, Sweep
+from tests.sweep_test import Sweep
 print("begun", flush=True)
-sys.exit(Sweep(pathlib.Path(sys.argv[2])).run(retries=0).status)
+sys.exit(Sweep(pathlib.Path(sys.argv[2])).run(retries=0))
 """
 
 
@@ -215,53 +225,110 @@ def driver(stubs):
     return process
 
 
-def wait_for(stubs, name, attempts):
-    deadline = time.monotonic() + 120
-    while not (stubs.count(name) >= attempts and (stubs.root / name / "config.json").exists()):
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-def test_a_sweep_that_is_killed_goes_on_and_its_runs_do_not_linger(stubs):
+@pytest.mark.skipif(sys.platform != "linux", reason="affinity and parents' deaths are Linux'")
+def test_a_sweep_that_is_killed_is_resumed_and_its_runs_do_not_linger(stubs):
     stubs.acts(b=["wait", "wait", "end"])
     first = driver(stubs)
-    wait_for(stubs, B, 1)
+    stubs.wait_for(B)
+    pid = json.loads((stubs.root / B / "lock").read_text())["pid"]
+    assert len(os.sched_getaffinity(pid)) == 1
+    assert "is at work there" in status_text(stubs) and f"process {pid} on" in status_text(stubs)
     first.kill()
     first.communicate()
     # Its run was told, and ends; the next one, stopped with Ctrl-C, waits for its runs to end.
     second = driver(stubs)
-    wait_for(stubs, B, 2)
-    assert states.look(stubs.root / B, CONFIG).kind == "busy"
+    stubs.wait_for(B, 2)
     second.send_signal(signal.SIGINT)
     second.communicate(timeout=120)
     assert second.returncode == 128 + signal.SIGINT
-    assert states.look(stubs.root / B, CONFIG).kind == "resumable"
-    assert stubs.record(B).ended is not None and stubs.record(B).reason == ""
-    assert stubs.run().status == 0
-    assert [stubs.count(name, "ends") for name in (A, B, C)] == [1, 1, 1]
+    assert stubs.seen()[B] == ("waiting", "") and "no sweep is at work there" in status_text(stubs)
+    assert stubs.run() == 0
+    assert stubs.count("ends") == [1, 1, 1]
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="affinity and parents' deaths are Linux'")
-def test_runs_keep_to_cores_of_their_own(stubs):
-    stubs.acts(a=["wait"], b=["wait"])
-    process = driver(stubs)
-    wait_for(stubs, A, 1)
-    wait_for(stubs, B, 1)
-    records = [stubs.record(A), stubs.record(B)]
-    found = [os.sched_getaffinity(record.pid) for record in records]
-    assert found == [set(record.cores) for record in records]
-    assert all(len(cores) == 1 for cores in found)
-    if len(os.sched_getaffinity(0)) > 2:
-        assert found[0] != found[1]
-    # A status from elsewhere.
-    assert states.alive(records[0]) and not states.alive(records[0]._replace(host="elsewhere"))
-    assert not states.alive(records[0]._replace(pid=2**30))
-    lines = table.status(stubs.root, manifest.read(stubs.root), 1)
-    assert "0 of 3 runs done, 2 running, 1 waiting" in lines[0]
-    assert lines[2].split()[:5] == [A, records[0].host, "core", str(records[0].cores[0]), "0/500"]
-    assert f"process {process.pid} on" in lines[-1] and "is at work there" in lines[-1]
-    process.kill()
-    process.communicate()
+def status_text(stubs):
+    return "\n".join(sweep.status_lines(stubs.root, 1))
+
+
+# What an executor is given
+
+
+def fake(monkeypatch, tmp_path, entries, workers=9, memory=None):
+    """The order in which runs begin and end where each takes a while; nothing is run."""
+    monkeypatch.setattr(states, "look_at_all", lambda root, entries: dict.fromkeys(entries, states.State("")))
+    monkeypatch.setattr(status, "ended_text", lambda run: "")
+    monkeypatch.setattr(status, "lines", lambda *_: [""])
+    log, at_once = [], []
+
+    def run(name):
+        log.append(f"+{name}")
+        at_once.append(sum(1 if x[0] == "+" else -1 for x in log))
+        time.sleep(0.05)
+        log.append(f"-{name}")
+        return 0, ""
+
+    with cf.ThreadPoolExecutor(9) as executor:
+        submit = lambda entry: executor.submit(run, entry.run.name)  # noqa: E731
+        assert launching.launch(tmp_path, entries, submit, lambda: workers, memory) == 0
+    assert len(log) == 2 * len(entries)
+    return log, max(at_once)
+
+
+def test_runs_are_given_in_order_and_as_many_as_there_is_room_for(monkeypatch, tmp_path):
+    entries = {name: entry(name) for name in "badc"} | {"x": entry("x", "y"), "y": entry("y", "a")}
+    log, most = fake(monkeypatch, tmp_path, entries, workers=1)
+    assert [name[1] for name in log[::2]] == list("badcyx") and most == 1
+    log, most = fake(monkeypatch, tmp_path, entries)
+    assert most == 4 and log.index("-a") < log.index("+y") < log.index("-y") < log.index("+x")
+    # The buffer: 100,000 frames of 42 x 42 bytes, and 600 MiB.
+    assert launching.run_bytes(CONFIG) == 600 * 1024**2 + 176_400_000
+    assert fake(monkeypatch, tmp_path, entries, memory=2.5 * launching.run_bytes(CONFIG))[1] == 2
+    assert fake(monkeypatch, tmp_path, entries, memory=0)[1] == 1  # a single one always fits
+
+
+def test_a_task_can_be_sent_elsewhere_and_a_lost_one_is_a_failure(tmp_path, monkeypatch):
+    sent = pickle.dumps((launching.attempt, tmp_path, A, ["x"], CONFIG, 1, 2))
+    assert pickle.loads(sent)[0] is launching.attempt
+    monkeypatch.setattr(states, "look_at_all", lambda root, entries: {A: states.State("missing")})
+    lost = cf.Future()
+    lost.set_exception(RuntimeError("\nthe node\ndied"))
+    assert launching.launch(tmp_path, {A: ALL[A]}, lambda entry: lost, lambda: 1) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="affinity is Linux'")
+@pytest.mark.parametrize("locks", [True, False])
+def test_a_run_has_a_core_to_itself_as_long_as_there_are_any(tmp_path, monkeypatch, locks):
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 5, 7})
+    monkeypatch.setattr(runtime, "has_gpu", lambda env: False)
+    if not locks:
+        monkeypatch.setattr(rundir, "_lock", lambda *_: "Function not implemented")
+    with launching.own_cores(1, tmp_path) as a, launching.own_cores(1, tmp_path) as b:
+        with launching.own_cores(1, tmp_path) as c:
+            assert sorted(a + b + c) == [2, 5, 7]
+            with launching.own_cores(2, tmp_path) as shared:  # none is free: as many as it has alone
+                assert len(set(shared)) == 2
+        with launching.own_cores(1, tmp_path) as again:
+            assert again == c
+        if locks:  # another sweep's
+            code = "from experiments.sweeping import launching as l; import os, pathlib, sys\n"
+            code += "os.sched_getaffinity = lambda pid: {2, 5, 7}\n"
+            code += "with l.own_cores(1, pathlib.Path(sys.argv[1])) as mine: print(mine)"
+            line = [sys.executable, "-c", code, str(tmp_path)]
+            assert json.loads(subprocess.run(line, capture_output=True, text=True).stdout) == c
+    monkeypatch.setattr(runtime, "has_gpu", lambda env: True)
+    with launching.own_cores(1, tmp_path) as none:
+        assert none == [] and launching.most_workers() == 1
+
+
+@pytest.mark.parametrize("address", ["localhost:1", "nowhere", "localhost:x", "localhost:99999999"])
+def test_without_ray_or_its_cluster_one_line_says_so(stubs, monkeypatch, address):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: True)
+    with pytest.raises(ConfigError, match=f"--ray_address={address}: no Ray cluster: "):
+        stubs.run(launcher="ray", ray_address=address)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(ConfigError, match=r"pip install 'srl-jax\[ray\]'"):
+        stubs.run(launcher="ray")
+    assert not (stubs.root / "sweep.json").exists()
 
 
 # The command line
@@ -293,6 +360,13 @@ def test_command_lines_that_are_refused(tmp_path, arguments, says):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("given", ["--lr_rl=1e-4,3e-4", "--mode=joint,rl_only"])
+def test_several_values_of_a_flag_are_a_grid(tmp_path, capsys, given):
+    with pytest.raises(SystemExit):
+        _main(f"--out={tmp_path}", given)
+    assert capsys.readouterr().err.endswith(f"; --grid {given[2:]} tries each\n")
+
+
 def test_flags_of_training_go_to_every_run(tmp_path):
     given = ("--steps=1e3", "--objective=inverse", "--nolife_loss", "--stop_at_return=off", "--rl=:n_step=2")
     values, root = _main(f"--out={tmp_path}", "--presets=small/joint_*", "--games=Catch", "--seeds=2", *given)
@@ -303,7 +377,7 @@ def test_flags_of_training_go_to_every_run(tmp_path):
         "life_loss": "false", "rl": ":n_step=2",
     }  # fmt: skip
     with pytest.raises(ConfigError, match="--gpus_per_run: only --launcher=ray"):
-        sweep.launcher_options(_main(f"--out={tmp_path}", "--gpus_per_run=1")[0])
+        options.launcher_options(_main(f"--out={tmp_path}", "--gpus_per_run=1")[0])
 
 
 def test_a_grid_makes_arms_and_it_is_said_whose_objectives_are_replaced(tmp_path, capsys):
@@ -313,27 +387,22 @@ def test_a_grid_makes_arms_and_it_is_said_whose_objectives_are_replaced(tmp_path
     assert [run.name.split("/")[1] for run in runs] == [
         f"{arm}_lr_rl={rate}" for arm in ("joint_256", "joint_50") for rate in ("1e-4", "3e-4")
     ]
-    sweep.say_what_is_replaced(values, runs)
+    options.say_what_is_replaced(values, runs)
     assert capsys.readouterr().err == (
         "objective: inverse in place of those of small/joint_256, small/joint_50; "
         "--objective=+NAME adds to them\n"
     )
-    with pytest.raises(ConfigError, match="--grid: only with --presets"):
-        sweep.chosen_runs(_main(f"--out={tmp_path}", "--grid", "lr_rl=1,2")[0], _planned(tmp_path))
 
 
-def _planned(root):
-    manifest.write(root, {A: manifest.Entry(run(A), CONFIG)})
-    return root
-
-
-def test_a_sweep_goes_on_as_it_was_planned_where_no_presets_are_given(stubs):
-    assert stubs.run().status == 0
-    values, root = _main(f"--out={stubs.root}")
-    assert sweep.chosen_runs(values, root) == RUNS
-    values, root = _main(f"--out={stubs.root}", "--gamma=0.9")
-    with pytest.raises(ConfigError, match="--gamma: only with --presets"):
-        sweep.chosen_runs(values, root)
+def test_a_sweep_is_resumed_as_it_was_planned_where_no_presets_are_given(tmp_path):
+    manifest.write(tmp_path, ALL)
+    assert manifest.read(tmp_path) == ALL
+    values, root = _main(f"--out={tmp_path}")
+    assert sweep.chosen_runs(values, root) == [run for run, _ in ALL.values()]
+    for given in (("--gamma=0.9",), ("--grid", "lr_rl=1,2")):
+        values, root = _main(f"--out={tmp_path}", *given)
+        with pytest.raises(ConfigError, match=f"--{given[0][2:6]}.*: only with --presets"):
+            sweep.chosen_runs(values, root)
 
 
 @pytest.mark.parametrize(
@@ -345,37 +414,19 @@ def test_a_sweep_goes_on_as_it_was_planned_where_no_presets_are_given(stubs):
         lambda about: json.dumps({**about, "runs": [{}]}),
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "name": "../../x"}]}),
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "name": "a/../x"}]}),
-        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "flags": {"steps": 3}}]}),
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "flags": []}]}),
+        lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "policy_from": "a/b/c"}]}),
         lambda about: json.dumps({**about, "runs": [{**about["runs"][0], "config": {"steps": -1}}]}),
         lambda about: "[" * 100_000,
     ],
 )
-def test_a_manifest_that_is_none_is_refused_in_one_line(stubs, spoil):
-    stubs.root.mkdir(exist_ok=True)
-    manifest.write(stubs.root, {A: manifest.Entry(RUNS[0], CONFIG)})
-    path = stubs.root / "sweep.json"
+def test_a_manifest_that_is_none_is_refused_in_one_line(tmp_path, spoil):
+    manifest.write(tmp_path, {A: ALL[A]})
+    path = tmp_path / "sweep.json"
     path.write_text(spoil(json.loads(path.read_text())))
     with pytest.raises(ConfigError, match="sweep.json: ") as refused:
-        manifest.read(stubs.root)
+        manifest.read(tmp_path)
     assert "\n" not in str(refused.value)
-
-
-def test_a_dry_run_writes_nothing_and_counts(stubs):
-    stubs.acts(a=["end"])
-    assert stubs.run([run(A)]).status == 0
-    before = sorted(stubs.root.rglob("*"))
-    lines = sweep.dry_run(stubs.root, [*RUNS, run("Catch/a/seed1")], workers=2, resolve=resolve)
-    # The run that is complete took 5 s: three more are 15 s, and two run at once.
-    assert lines[1].split() == ["Catch/a", "2", "1", "1", "500", "100", "0:00:05"]
-    assert lines[-1] == (
-        "3 of 4 runs to run, 1,500 env steps, 0:00:08 with 2 at once; speeds: runs of this sweep"
-    )
-    assert sorted(stubs.root.rglob("*")) == before
-    line, why = sweep.dry_run(stubs.root / "new", [run(A)], workers=2, resolve=resolve)[2:]
-    assert line == "1 of 1 runs to run, 500 env steps, unknown time with 2 at once; speeds: unknown"
-    assert why.startswith("unknown: no run of this game's kind, encoder and mode has been timed")
-    assert "--status" in why
 
 
 def test_bad_input_is_one_line_and_status_2(tmp_path):

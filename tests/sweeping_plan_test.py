@@ -2,12 +2,10 @@
 
 import pytest
 
-from experiments import collect
 from experiments.presets import PRESETS
-from experiments.sweeping import best, plan, resolving
+from experiments.sweeping import manifest, plan
 from experiments.sweeping.plan import Arm, Planned, arm_of
 from srl_jax.errors import ConfigError
-from tests.helpers import write_run
 
 
 def test_what_a_run_starts_from_is_planned_once_and_before_it():
@@ -36,6 +34,18 @@ def test_an_arm_may_be_the_source_of_another():
     # In another mode it needs no encoder.
     (alone,) = plan.plan([Arm("a", "small/frozen_256", {"mode": "rl_only"})], [], [0])
     assert alone == Planned("Pong/a/seed0", "small/frozen_256", alone.flags) or alone.sources == []
+
+
+def test_what_a_process_elsewhere_imports_is_named_absolutely(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "mine.py").write_text("")
+    flags = {"import": ("mine",), "logger": ("csv,mine.py:Mine", "wandb:project=a")}
+    (run,) = plan.plan([arm_of("small/joint_256")], ["Catch"], [0], flags)
+    assert run.flags["import"] == (f"{tmp_path}/mine.py",)
+    assert run.flags["logger"] == ("csv", f"{tmp_path}/mine.py:Mine", "wandb:project=a")
+    assert manifest.parsed(run).loggers == run.flags["logger"]
+    (run,) = plan.plan([arm_of("small/joint_256")], ["Catch"], [0], {"logger": "none"})
+    assert run.flags["logger"] == ("none",) and manifest.parsed(run).loggers == ()
 
 
 @pytest.mark.parametrize(
@@ -105,7 +115,7 @@ def test_a_command_line_is_the_runs_own():
 def test_configurations_are_those_that_training_writes():
     flags = {"encoder": "tiny:features=8", "objective": ("forward_pixels", "latent_l2"), "rl": ":n_step=2"}
     (run,) = plan.plan([Arm("a", "small/joint_256", flags)], ["CatchDistractor"], [4], {"steps": "500"})
-    (config,) = resolving.resolve_here([run]).values()
+    ((_, config),) = manifest.resolve([run]).values()
     assert (config.game, config.seed, config.steps) == ("CatchDistractor", 4, 500)
     assert config.objectives == ("forward_pixels:weight=1.0", "latent_l2:weight=1e-06")
     assert "n_step=2" in config.rl and config.encoder.startswith("tiny:features=8")
@@ -130,7 +140,7 @@ def test_configurations_are_those_that_training_writes():
 )
 def test_settings_that_cannot_be_run_name_the_run(arm, says):
     with pytest.raises(ConfigError, match=says):
-        resolving.resolve_here(plan.plan([arm], ["Catch"], [0]))
+        manifest.resolve(plan.plan([arm], ["Catch"], [0]))
 
 
 def test_a_grid_is_an_arm_for_each_combination():
@@ -143,8 +153,8 @@ def test_a_grid_is_an_arm_for_each_combination():
     assert len(arms) == 8 and arms[4].preset == "catch/rl_only"
     assert arms[0].flags == {"lr_rl": "1e-4", "rl": ":n_step=1"}
     runs = plan.plan(arms[:4], [], [0], {})
-    configs = resolving.resolve_here(runs)
-    assert {(config.lr_rl, config.rl.split(":")[0]) for config in configs.values()} == {
+    entries = manifest.resolve(runs)
+    assert {(config.lr_rl, config.rl.split(":")[0]) for _, config in entries.values()} == {
         (lr, rl) for lr in (1e-4, 3e-4) for rl in ("rainbow", "dqn")
     }
     assert plan.grid(arms[:1], [], {}) == arms[:1]
@@ -176,20 +186,3 @@ def test_a_composed_preset_is_swept_with_what_it_starts_from():
     ]  # fmt: skip
     with pytest.raises(ConfigError, match="arm joint_smal: catch/joint.smal: did you mean small"):
         plan.plan([plan.arm_of("catch/joint+smal")], [], [0])
-
-
-def test_the_best_arm_comes_first(tmp_path):
-    # Areas by hand: 1 and 1; 2 and 3, whose interval is 2.5 and 12.706 times 0.5 to either side.
-    for arm, returns in {"a": [(0, 2), (2, 0)], "b": [(1, 3), (2, 4)]}.items():
-        for seed, its in enumerate(returns):
-            write_run(tmp_path / "Catch" / arm / f"seed{seed}", its, seed=seed)
-    write_run(tmp_path / "CatchDistractor" / "a" / "seed0", game="CatchDistractor")
-    lines = best.lines(collect.load_runs(tmp_path))
-    assert [line.split() for line in lines[:3]] == [
-        ["Catch", "seeds", "area", "95", "%", "at", "the", "end"],
-        ["b", "2", "2.5", "[-3.853,", "8.853]", "3.5"],
-        ["a", "2", "1", "-", "1"],
-    ]
-    assert lines[3].startswith("area: mean evaluation return up to 100 env steps. The best of 2 is flattered")
-    assert len(lines) == 4
-    assert best.lines(collect.load_runs(tmp_path / "CatchDistractor")) == []

@@ -1,5 +1,7 @@
 """srl_jax/training.py: a run by one call, as the command makes it."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -8,19 +10,22 @@ from srl_jax import ending
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.metrics import read_metrics
-from srl_jax.training import resolved
+from srl_jax.training import check_sources, resolved
+from tests.checkpoint_test import CONFIG, write
 from tests.helpers import SMALL
 
 
 def test_a_run_is_trained_into_a_new_directory_and_loaded(tmp_path):
     path = tmp_path / "runs" / "x"
-    config = Config(**{**SMALL, "steps": 120, "eval_every": 60, "keep_encoder_every": 1})
+    config = Config(**{**SMALL, "steps": 120, "eval_every": 60, "keep_encoder_every": 1}, loggers=("csv",))
     result = srl_jax.train(config, str(path), progress=False)
     assert (result.env_steps, result.interrupted) == (120, False)
     assert ending.read(path).status == "finished" and not (path / "lock").exists()
     # config.json has every option, as the command writes it.
     assert Config.load(path) == resolved(config) != config
-    assert read_metrics(path / "metrics.jsonl")[-1]["env_steps"] == 120
+    rows = read_metrics(path / "metrics.jsonl")
+    assert rows[-1]["env_steps"] == 120
+    assert len((path / "metrics.csv").read_text().splitlines()) == 1 + len(rows)
     loaded = srl_jax.load(path)
     assert loaded.env_steps == 120 and loaded.config == resolved(config)
     assert srl_jax.load(path / "best").act(np.zeros((2, 42, 42, 4), np.uint8)).shape == (2,)
@@ -37,6 +42,7 @@ def test_a_run_is_trained_into_a_new_directory_and_loaded(tmp_path):
         ({"mode": "frozen"}, "--encoder_from: --mode=frozen needs"),
         ({"rl": "rainboww"}, "--rl=rainboww: no 'rainboww'; did you mean rainbow"),
         ({"rl": "c51:n_step=0"}, "--rl=c51:n_step=0: n_step must be at least 1"),
+        ({"loggers": ("csvv",)}, "--logger=csvv: no 'csvv'; did you mean csv"),
         ({"game": "no_module_here:Game-v0"}, "--game=no_module_here:Game-v0: "),
         ({"mode": "frozen", "encoder_from": "nowhere"}, "--encoder_from=nowhere: "),
         ({"buffer_size": 35, "learn_start": 8}, "--buffer_size=35: capacity must be at least 36"),
@@ -53,3 +59,49 @@ def test_a_file_is_no_place_for_a_run(tmp_path):
     with pytest.raises(ConfigError, match="not an empty directory"):
         srl_jax.train(Config(**SMALL), tmp_path / "x")
     assert (tmp_path / "x").read_text() == "mine"
+
+
+PRETRAIN = {"mode": "pretrain", "objectives": ("reconstruction",)}
+SOURCES = {"encoder_from": {"mode": "frozen"}, "policy_from": PRETRAIN}
+
+
+@pytest.mark.parametrize(
+    ("flag", "change", "message"),
+    [
+        ("encoder_from", {}, None),
+        ("encoder_from", {"seed": 6, "mode": "finetuned"}, None),
+        (
+            "encoder_from",
+            {"encoder": "tiny:features=16"},
+            "the architecture differs: encoder is tiny:features=8",
+        ),
+        ("encoder_from", {"encoder": "nature"}, "the architecture differs: encoder is .* and nature here"),
+        ("encoder_from", {"frame_size": 84}, "the preprocessing differs: frame_size is 42 there and 84 here"),
+        ("encoder_from", {"frame_stack": 3}, "the preprocessing differs: frame_stack is 4 there and 3 here"),
+        ("policy_from", {"encoder": "nature"}, None),  # a policy brings its own encoder
+        ("policy_from", {"game": "CatchDistractor"}, "the game differs"),
+        ("policy_from", {"frame_size": 84}, "the preprocessing differs"),
+        ("policy_from", {"frame_stack": 3}, "the preprocessing differs"),
+    ],
+)
+def test_a_source_that_does_not_fit_is_refused(tmp_path, flag, change, message):
+    write(tmp_path)
+    config = dataclasses.replace(CONFIG, **SOURCES[flag] | change | {flag: str(tmp_path)})
+    if message is None:
+        check_sources(config)
+    else:
+        with pytest.raises(ConfigError, match=f"--{flag}={tmp_path}: {message}"):
+            check_sources(config)
+
+
+def test_a_representation_run_has_no_policy(tmp_path):
+    write(tmp_path, config=dataclasses.replace(CONFIG, **PRETRAIN))
+    with pytest.raises(ConfigError, match="has no policy"):
+        check_sources(dataclasses.replace(CONFIG, **PRETRAIN, policy_from=str(tmp_path)))
+
+
+@pytest.mark.parametrize("flag", SOURCES)
+def test_a_source_that_is_not_there_is_named_with_its_flag(tmp_path, flag):
+    config = dataclasses.replace(CONFIG, **{flag: str(tmp_path / "none")})
+    with pytest.raises(ConfigError, match=f"--{flag}=.*none: .*no checkpoint there"):
+        check_sources(config)

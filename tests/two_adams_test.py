@@ -122,9 +122,10 @@ def window(pixels, actions, targets):
 def test_ten_updates_are_pytorchs(form, clip):
     encoder, terms = network()
     optimizer = make_optimizer(terms, decoder_weight_decay=DECAY, max_grad_norm=clip)
-    init = make_init(encoder, terms, MODES["joint"], optimizer, encoder_optimizer=form)
+    plan = passes(MODES["joint"], terms, form)
+    init = make_init(encoder, terms, MODES["joint"], optimizer, plan=plan)
     state = init(jax.random.key(0), {**start(), "l2": {}})
-    update = jax.jit(make_update(encoder, terms, MODES["joint"], optimizer, encoder_optimizer=form))
+    update = jax.jit(make_update(encoder, terms, MODES["joint"], optimizer, plan=plan))
     hyper = Hyper({name: np.float32(term.weight) for name, term in terms.items()}, RATES)
     for i, batch in enumerate(batches()):
         before = state.params["encoder"]

@@ -20,6 +20,7 @@ from srl_jax.update import (
     make_latents,
     make_update,
     named_key,
+    passes,
     periodic,
     shift,
 )
@@ -54,13 +55,13 @@ SMALL = make_window()
 RATES = dict.fromkeys(("encoder", "encoder_srl", RL, "representation"), np.float32(0.1))
 
 
-def make_peeks(*names, mode="joint", every=2, clip=0.0, **options):
+def make_peeks(*names, mode="joint", every=2, clip=0.0, form="separate", target_encoder="slow", **options):
     """(init, update, hyper) of peeks by name; RL's has a slow copy."""
     terms = {name: make_peek(slow=periodic(every) if name == RL else None) for name in names}
     optimizer = make_optimizer(terms, max_grad_norm=clip)
-    starts = {n: v for n, v in options.items() if n in ("target_encoder", "encoder_optimizer")}
-    init = make_init(PIXELS, terms, MODES[mode], optimizer, **starts)
-    update = make_update(PIXELS, terms, MODES[mode], optimizer, **options)
+    plan = passes(MODES[mode], terms, form)
+    init = make_init(PIXELS, terms, MODES[mode], optimizer, plan=plan, target_encoder=target_encoder)
+    update = make_update(PIXELS, terms, MODES[mode], optimizer, plan=plan, **options)
     return init, update, Hyper(dict.fromkeys(names, np.float32(1)), RATES)
 
 
@@ -73,7 +74,7 @@ def test_each_augmentation_and_who_sees_it():
     assert not any(np.array_equal(*pair) for pair in zip(shifted, SMALL.frames, strict=True))
     views = {"none": (SMALL.frames, SMALL.frames), "srl": (SMALL.frames, shifted), "all": (shifted, shifted)}
     for augment, (rl_view, representation_view) in views.items():
-        init, update, hyper = make_peeks(RL, "peek", augment=augment, encoder_optimizer="summed")
+        init, update, hyper = make_peeks(RL, "peek", augment=augment, form="summed")
         _, _, metrics = jit(update)(init(key), SMALL, hyper)
         for name, view in ((RL, rl_view), ("peek", representation_view)):
             np.testing.assert_array_equal(metrics[f"{name}/frames"], view, err_msg=f"{augment} {name}")
@@ -127,12 +128,12 @@ def test_noise_differs_between_updates_and_seeds():
 def test_an_update_of_some_objectives_leaves_the_others_alone():
     terms = {name: make_peek(slow=periodic(2) if name == RL else None) for name in (RL, "peek")}
     optimizer = make_optimizer(terms)
-    how = {"encoder_optimizer": "summed"}
-    init = make_init(PIXELS, terms, MODES["joint"], optimizer, **how)
+    plans = {names: passes(MODES["joint"], names, "summed") for names in (tuple(terms), (RL,))}
+    init = make_init(PIXELS, terms, MODES["joint"], optimizer, plan=plans[tuple(terms)])
     hyper = Hyper(dict.fromkeys(terms, np.float32(1)), RATES)
     update = {
-        only: jit(make_update(PIXELS, terms, MODES["joint"], optimizer, only=only, **how))
-        for only in (None, (RL,))
+        names: jit(make_update(PIXELS, terms, MODES["joint"], optimizer, plan=plan))
+        for names, plan in plans.items()
     }
     start = init(jax.random.key(0))
     one, td_error, metrics = update[(RL,)](start, SMALL, hyper)
@@ -142,11 +143,12 @@ def test_an_update_of_some_objectives_leaves_the_others_alone():
     for tree in (lambda s: s.params[RL], lambda s: s.params["encoder"]):
         assert all_moved(tree(one), tree(start))
     # RL sees the same noise and moves its head alike, whether others are computed or not.
-    both, _, _ = update[None](start, SMALL, hyper)
+    both, _, _ = update[tuple(terms)](start, SMALL, hyper)
     np.testing.assert_allclose(one.params[RL]["w"], both.params[RL]["w"], rtol=1e-6)
     assert not identical(one.opt_state["encoder"], both.opt_state["encoder"])
     # In decoupled, the encoder is trained by what is left out, and so rests; Adam counts no step for it.
-    rests = jit(make_update(PIXELS, terms, MODES["decoupled"], optimizer, only=(RL,)))
+    plan = passes(MODES["decoupled"], (RL,))
+    rests = jit(make_update(PIXELS, terms, MODES["decoupled"], optimizer, plan=plan))
     after, _, _ = rests(start, SMALL, hyper)
     assert identical(after.params["encoder"], start.params["encoder"])
     assert identical(after.opt_state["encoder"], start.opt_state["encoder"])
@@ -205,7 +207,7 @@ def test_no_gradient_through_the_target_encoder():
         terms, options = {RL: objective}, {"target_encoder": target_encoder}
         optimizer = make_optimizer(terms)
         state = make_init(PIXELS, terms, MODES["joint"], optimizer, **options)(jax.random.key(0))
-        update = make_update(PIXELS, terms, MODES["joint"], optimizer, **options)
+        update = make_update(PIXELS, terms, MODES["joint"], optimizer)
         after, _, _ = jit(update)(state, SMALL, Hyper({RL: 1.0}, RATES))
         assert identical(state.params["encoder"], after.params["encoder"])
         assert not identical(state.params[RL], after.params[RL])
@@ -346,10 +348,13 @@ def test_weights_must_be_those_of_the_losses():
             update(init(jax.random.key(0)), SMALL, hyper._replace(weights=weights))
 
 
-@pytest.mark.parametrize("option", [{"augment": "both"}, {"target_encoder": "fast"}])
-def test_unknown_options_are_refused(option):
-    with pytest.raises(ValueError, match=next(iter(option))):
-        make_update(PIXELS, {}, MODES["joint"], None, **option)
+def test_unknown_options_are_refused():
+    with pytest.raises(ValueError, match="augment"):
+        make_update(PIXELS, {}, MODES["joint"], None, augment="both")
+    with pytest.raises(ValueError, match="target_encoder"):
+        make_init(PIXELS, {}, MODES["joint"], None, target_encoder="fast")
+    with pytest.raises(ValueError, match="encoder_optimizer"):
+        passes(MODES["joint"], (), "both")
 
 
 def test_a_gate_that_is_shut_costs_no_differentiation():

@@ -7,48 +7,62 @@ needs PyTorch or Tianshou runs in an environment of its own (`make bench-install
 `--out=DIR` also writes bench.json, with every repetition, and bench.md, the table.
 """
 
+import contextlib
 import datetime
 import json
 import math
 import os
 import platform
+import re
 import subprocess
 import sys
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from absl import flags
 
-from srl_jax.config import git_revision, versions
+from srl_jax import display
 from srl_jax.errors import ConfigError
-from srl_jax.specs import choices_text
+from srl_jax.provenance import git_revision, versions
+from srl_jax.specs import Info, choices_text
 
 from .. import flags as config_flags
 from .. import runtime
-from . import table
-from .rows import CHECK_UPDATES, ROWS, SIDES, Side, series_of, sides_of
-from .runner import TOLERANCE, CheckFailed, Results, measure
+from .rows import GROUPS, Group
 from .worker import ROOT, Worker, WorkerError
 
 FLAGS = flags.FLAGS
 PYTHON = ".venv-bench/bin/python"
+ROWS = {name: row for group in GROUPS for name, row in group.rows.items()}
+CHECK_UPDATES = 2
+"""Updates whose losses must be equal; the second one's depend on the first one's gradients."""
+TOLERANCE = 1e-4
+"""Largest relative difference of two losses that count as equal."""
 BUSY = 0.5
 """Load average from which on other programs are warned of."""
+HEAD = ("name", "this project", "the other side", "ratio", "goal")
+
+
+class CheckFailed(RuntimeError):
+    """The two sides do not compute the same."""
 
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_integer("rounds", 7, "how often each worker takes its turn", flag_values=values)
+    config_flags.define("rounds", Info(int, "how often each worker takes its turn", minimum=1), 7, values)
     flags.DEFINE_list("only", None, f"rows to measure, of: {', '.join(ROWS)}", flag_values=values)
-    flags.DEFINE_string(
-        "out", None, "directory for bench.json and bench.md; must be new or empty", flag_values=values
-    )
-    flags.DEFINE_string(
-        "bench_python", PYTHON, "interpreter that has PyTorch and Tianshou", flag_values=values
-    )
+    out = "directory for bench.json and bench.md; must be new or empty"
+    flags.DEFINE_string("out", None, out, flag_values=values)
+    other = "interpreter that has PyTorch and Tianshou"
+    flags.DEFINE_string("bench_python", PYTHON, other, flag_values=values)
+    quick = "one round of turns a twelfth as long, to try this program; its figures say nothing"
+    flags.DEFINE_boolean("quick", False, quick, flag_values=values)
 
 
-def chosen_rows(only: list[str] | None) -> list[str]:
+def chosen_rows(only: Sequence[str] | None) -> list[str]:
     """The rows that --only names, in the table's order; None: all.
 
     Raises:
@@ -76,87 +90,130 @@ def check_out(out: str | None) -> Path | None:
     return path
 
 
-def has(python: Path, package: str) -> bool:
-    """Whether an interpreter has a package."""
-    code = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({package!r}) is None)"
+def other_versions(python: str) -> dict[str, str]:
+    """What an interpreter has to compare with; {} unless it has both PyTorch and Tianshou."""
+    code = "import importlib.metadata as m, json; "
+    code += "print(json.dumps({name: m.version(name) for name in ('torch', 'tianshou', 'numpy')}))"
     try:
-        return subprocess.run([python, "-c", code], cwd=ROOT, stderr=subprocess.DEVNULL).returncode == 0
+        done = subprocess.run([python, "-c", code], cwd=ROOT, capture_output=True)
     except OSError:
-        return False
-
-
-def lacking(rows: list[str], python: Path) -> dict[str, str]:
-    """{row: the package that it needs and nobody has}."""
-    there: dict[tuple[Path, str], bool] = {}
-    found = {}
-    for row in rows:
-        for name in sides_of([row]):
-            side = SIDES[name]
-            needs = [(python, side.needs)] if side.needs else [(Path(sys.executable), "jax")]
-            if side.module in ("host_side", "train_side"):
-                needs.append((Path(sys.executable), "ale_py"))
-            for need in needs:
-                if need not in there:
-                    there[need] = has(*need)
-                if not there[need]:
-                    found.setdefault(row, need[1])
-    return found
-
-
-def start(side: Side, python: Path) -> Worker:
-    """A worker's process; this project's compute on the CPU, in the environment that runs give themselves."""
-    program = python if side.needs else Path(sys.executable)
-    command = [str(program), "-m", f"experiments.benchmarks.{side.module}", *side.arguments]
-    return Worker(command, None if side.needs else {"JAX_PLATFORMS": "cpu"})
+        return {}
+    return {} if done.returncode else json.loads(done.stdout)
 
 
 def cpu_model() -> str:
     """The processor's name."""
     try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-        return next(line.split(":", 1)[1].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor() or platform.machine()
+        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    except OSError:
+        text = ""
+    found = re.search(r"^model name\s*:\s*(.*)$", text, re.MULTILINE)
+    return found[1] if found else platform.machine()
 
 
-def load() -> float:
-    """How many programs have been running for the last minute, NaN where the system does not tell."""
-    try:
-        return os.getloadavg()[0]
-    except (AttributeError, OSError):
-        return math.nan
+def difference(ours: Sequence[Mapping[str, float]], theirs: Sequence[Mapping[str, float]]) -> float:
+    """The largest relative difference of the losses of the same updates.
+
+    Raises:
+        CheckFailed: it is above `TOLERANCE`, or they are not the same updates or losses.
+    """
+    if [set(losses) for losses in ours] != [set(losses) for losses in theirs]:
+        raise CheckFailed(f"the sides compute different losses: {ours} and {theirs}")
+    pairs = [(mine[name], their[name]) for mine, their in zip(ours, theirs, strict=True) for name in mine]
+    found = float(np.max([abs(a - b) / max(abs(a), abs(b), 1e-30) for a, b in pairs]))  # NaN where one is
+    if not found <= TOLERANCE:
+        raise CheckFailed(f"a loss differs by {found:.1e} of its value, more than {TOLERANCE:.0e}")
+    return found
+
+
+def start(group: Group, rows: Sequence[str], python: str, stack: contextlib.ExitStack) -> tuple[dict, dict]:
+    """Starts the workers that some rows of a group need, and compares their losses with their twins'.
+
+    Returns:
+        {name: worker}, and {name: the largest relative difference of a loss} of those that have a twin.
+    """
+    workers, checks, checked = {}, {}, {}
+    for name, program in group.needed(rows).items():
+        interpreter = python if program.is_other else None
+        worker = stack.enter_context(Worker(program.side, program.arguments, interpreter))
+        worker.ask("build")
+        workers[name] = worker
+        if twin := program.twin:
+            if twin not in checked:
+                checked[twin] = workers[twin].ask("check", updates=CHECK_UPDATES)
+            losses, given = checked[twin]
+            checks[name] = difference(losses, worker.ask("check", updates=CHECK_UPDATES, **given))
+        display.say(f"bench: {name} is ready")
+    return workers, checks
+
+
+def measure(
+    group: Group, rows: Sequence[str], *, rounds: int, python: str, quick: bool = False
+) -> tuple[dict[str, list[list[float]]], dict[str, float]]:
+    """Measures some rows of a group.
+
+    Args:
+        group: its workers take turns.
+        rows: their names.
+        rounds: how often each worker takes its turn.
+        python: the interpreter of the other sides.
+        quick: turns are a twelfth as long.
+
+    Returns:
+        {series: the repetitions of each round}, and what `start` found.
+
+    Raises:
+        WorkerError: a worker failed.
+        CheckFailed: the sides compute different losses.
+    """
+    replies: dict[str, list[list[float]]] = {}
+    rounds = min(rounds, group.rounds)
+    with contextlib.ExitStack() as stack:
+        workers, checks = start(group, rows, python, stack)
+        begun = time.monotonic()
+        for number in range(1, rounds + 1):
+            for name, worker in workers.items():
+                turn = group.programs[name].turn
+                turn = {what: math.ceil(count / 12) for what, count in turn.items()} if quick else turn
+                for series, found in worker.ask("turn", **turn).items():
+                    replies.setdefault(f"{name}.{series}", []).append(found)
+            left = (rounds / number - 1) * (time.monotonic() - begun)
+            display.say(f"bench: {', '.join(rows)}: round {number} of {rounds}, {left:.0f} s left")
+    return replies, checks
+
+
+def table(lines: Sequence[Sequence[str]]) -> str:
+    """A Markdown table with columns that line up in a terminal too; ends with a newline."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    head, *rest = (" | ".join(map(str.ljust, line, widths)) for line in lines)
+    rule = " | ".join("-" * width for width in widths)
+    return "".join(f"| {line} |\n" for line in (head, rule, *rest))
 
 
 def report(
-    rows: list[str], skipped: dict[str, str], results: Results, about: dict[str, Any]
-) -> tuple[str, dict]:
-    """The table with what stands around it, and what bench.json holds."""
-    lines, records = [], {}
+    rows: Sequence[str], replies: Mapping[str, Any], checks: Mapping[str, float], about: Mapping[str, Any]
+) -> tuple[str, dict[str, Any]]:
+    """The table with what stands around it, and what bench.json holds; see `measure`.
+
+    Rows without replies were skipped.
+    """
+    lines, records = [HEAD], {}
     for name in rows:
         row = ROWS[name]
-        if name in skipped:
-            lines.append(table.skipped_cells(row.title, row.unit, row.goals))
-            records[name] = {"title": row.title, "skipped": f"no {skipped[name]}"}
-            continue
-        theirs = {label: results.replies[series] for label, series in row.theirs.items()}
-        found = table.figures(results.replies[row.ours], theirs, row.speedup, row.goals)
-        lines.append(table.cells(row.title, row.unit, found, row.goals))
-        records[name] = {
-            "title": row.title,
-            "unit": row.unit,
-            "figures": table.as_json(found, row.goals),
-            "rounds": {series: results.replies[series] for series in series_of(row)},
-        }
-    text = table.markdown(lines)
-    text += f"\nMedians of {about['rounds']} rounds, in brackets their quartiles, on {about['cores']} cores "
-    text += f"of {about['cpu']}.\n"
+        lines.append(row.cells(replies))
+        records[name] = {"title": row.title, "unit": row.unit, "goal": row.goal}
+        if found := row.figures(replies):
+            records[name] |= {"figures": found, "rounds": {series: replies[series] for series in row.series}}
+    text = f"{table(lines)}\nMedians of {about['rounds']} rounds, in brackets their quartiles, on "
+    text += f"{about['cores']} cores of {about['cpu']}.\n"
     if about["load"] > BUSY:
         text += f"Other programs were running: load average {about['load']:.1f} at the start.\n"
-    if results.checks:
-        shown = ", ".join(f"{arm} {value:.0e}" for arm, value in results.checks.items())
+    if checks:
         text += f"Check passed: from equal weights, without noise, the losses of {CHECK_UPDATES} updates are "
-        text += f"PyTorch's. Largest relative difference ({TOLERANCE:.0e} allowed): {shown}.\n"
-    return text, {**about, "checks": results.checks, "workers": results.versions, "rows": records}
+        text += (
+            f"PyTorch's. Largest relative difference: {max(checks.values()):.0e} ({TOLERANCE:.0e} allowed).\n"
+        )
+    return text, {**about, "checks": checks, "rows": records}
 
 
 def bench(values: flags.FlagValues) -> None:
@@ -166,39 +223,35 @@ def bench(values: flags.FlagValues) -> None:
         ConfigError: the command line is not valid; nothing was written.
         WorkerError, CheckFailed: as `measure`.
     """
-    rounds = values["rounds"].value
-    if rounds < 1:
-        raise ConfigError(f"--rounds={rounds}: must be at least 1")
-    rows = chosen_rows(values["only"].value)
-    path = check_out(values["out"].value)
-    python = Path(values["bench_python"].value).expanduser()
-    python = python if python.is_absolute() else ROOT / python
-    skipped = lacking(rows, python)
-    for package in dict.fromkeys(skipped.values()):
-        names = ", ".join(name for name, lacks in skipped.items() if lacks == package)
-        where = "make install" if package in ("jax", "ale_py") else "make bench-install"
-        print(f"skipped for want of {package}: {names}; `{where}` installs it", file=sys.stderr)
+    rows, path = chosen_rows(values["only"].value), check_out(values["out"].value)
+    quick = values["quick"].value
+    python = str(ROOT / Path(values["bench_python"].value).expanduser())
     about = {
         "date": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "cpu": cpu_model(),
         "cores": runtime.cores(),
-        "load": load(),
+        "load": os.getloadavg()[0],
         "git_revision": git_revision(),
         "versions": versions(),
-        "rounds": rounds,
+        "other_versions": other_versions(python),
+        "rounds": 1 if quick else values["rounds"].value,
     }
     if about["load"] > BUSY:
-        print(f"load average {about['load']:.1f}: other programs distort what is measured", file=sys.stderr)
-    measured = [name for name in rows if name not in skipped]
-    sides = {name: SIDES[name] for name in sides_of(measured)}
-    results = measure(
-        {name: ROWS[name] for name in measured},
-        sides,
-        rounds=rounds,
-        start=lambda side: start(side, python),
-        threads=runtime.cores(),
-    )
-    text, record = report(rows, skipped, results, about)
+        display.say(f"load average {about['load']:.1f}: other programs distort what is measured")
+    if not about["other_versions"]:
+        display.say(
+            "PyTorch and Tianshou are not there, `make bench-install` installs them; their rows are skipped"
+        )
+    replies, checks = {}, {}
+    for group in GROUPS:
+        chosen = [name for name in rows if name in group.rows]
+        if not about["other_versions"]:
+            chosen = [name for name in chosen if not any(x.is_other for x in group.needed([name]).values())]
+        if chosen:
+            found = measure(group, chosen, rounds=about["rounds"], python=python, quick=quick)
+            replies |= found[0]
+            checks |= found[1]
+    text, record = report(rows, replies, checks, about)
     print(text, end="")
     if path is not None:
         path.mkdir(parents=True, exist_ok=True)

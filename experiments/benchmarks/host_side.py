@@ -1,10 +1,5 @@
-"""This project's side of the benchmarks of the loop and of replay; answers `worker` requests.
+"""This project's loop and its replay; two sides of `worker`."""
 
-`python -m experiments.benchmarks.host_side ENCODER`, in the environment that a run with this encoder gives
-itself. Imports jax when it is first asked.
-"""
-
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -12,194 +7,145 @@ from typing import Any
 
 import numpy as np
 
-from srl_jax.config import versions
+from srl_jax import envs, loop, replay
+from srl_jax.agent import make_agent
 
-from .. import runtime
-from .worker import serve
+from .jax_side import NUM_ACTIONS, config_of, frame_shape
 
 WARM_UPDATES = 5
 """Updates of the loop before anything is timed."""
 
-STREAMS, CAPACITY, STACK, HORIZON, SIDE = 10, 100_000, 4, 3, 84
-"""Of the replay buffer."""
-
-BATCH, BETA = 32, 0.4
+BETA = 0.4
 
 
-def timed(function: Callable[[], Any]) -> float:
-    """Seconds of a call."""
+def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """Milliseconds of a call, and what it returns."""
     start = time.perf_counter()
-    function()
-    return time.perf_counter() - start
+    found = function(*arguments)
+    return 1e3 * (time.perf_counter() - start), found
 
 
 class Loop:
-    """A run of `srl_jax.loop`, step by step, without evaluation and files; `setup` comes first."""
+    """A run of a preset, without evaluation and files, past its first updates."""
 
-    def setup(self, preset: str) -> dict[str, Any]:
-        """Builds the run, and takes it past its first updates. Replies with "versions"."""
-        from srl_jax import loop
-
-        from .jax_side import config_of
-
-        self._acting = []
+    def __init__(self, preset: str):
         self._run = loop.Run([config_of(preset)], [Path()])
-        act_and_step = self._run.act_and_step
-
-        def timed_act_and_step(*arguments):
-            start = time.perf_counter()
-            result = act_and_step(*arguments)
-            self._acting.append(time.perf_counter() - start)
-            return result
-
-        self._run.act_and_step = timed_act_and_step
         self._run.begin()
         while self._run.updates < WARM_UPDATES:
             self._run.step()
         self._forget()
-        return {"versions": versions()}
 
-    def run(self, env_steps: int) -> dict[str, Any]:
-        """Goes on with training, and ends with what a row of metrics.jsonl waits for.
+    def turn(self, env_steps: int, iterations: int) -> dict[str, list[float]]:
+        """Goes on with training.
 
         Args:
             env_steps: how long, rounded up to whole steps of all environments.
+            iterations: steps of all environments with the updates that are due, and as many of either half.
 
         Returns:
-            "seconds" by the wall clock, "env_steps" and "updates" done.
+            "rate" of the first, env steps a second, to the end of what a row of metrics.jsonl waits for;
+            milliseconds of each "iteration", and "busy", processor time to wall-clock time meanwhile. The
+            "slower half" of an iteration is the slower one of acting and stepping the environments, while
+            nothing is updated, and its updates, with sampling and priorities, while no environment moves.
         """
         run = self._run
-        env_steps, updates = run.env_steps + env_steps, run.updates
-        begun = run.env_steps
-        start = time.perf_counter()
-        while run.env_steps < env_steps:
+        first, start = run.env_steps, time.perf_counter()
+        while run.env_steps < first + env_steps:
             run.step()
         self._forget()
-        seconds = time.perf_counter() - start
-        return {"seconds": seconds, "env_steps": run.env_steps - begun, "updates": run.updates - updates}
+        rate = (run.env_steps - first) / (time.perf_counter() - start)
 
-    def parts(self, iterations: int) -> dict[str, Any]:
-        """Whole iterations of the loop, then as many of either of its two parts alone.
-
-        Returns:
-            Lists of seconds: "iteration"; "acting", acting and the step of all environments, while nothing
-            is updated; "update", from sampling to setting priorities, while no environment moves. And "busy":
-            processor time of the whole iterations to their wall-clock time.
-        """
-        run = self._run
-        busy = time.process_time()
-        iteration = [timed(run.step) for _ in range(iterations)]
-        busy = (time.process_time() - busy) / sum(iteration)
-        self._acting.clear()
-        updates, run.updates = run.updates, 10**12  # as if all had been done
-        for _ in range(iterations):
-            run.step()
-        run.updates = updates
-        acting = list(self._acting)
+        processor = time.process_time()
+        iteration = [timed(run.step)[0] for _ in range(iterations)]
+        busy = 1e3 * (time.process_time() - processor) / sum(iteration)
+        before = run.schedules.updates_due(run.env_steps)
+        acting = [self._act() for _ in range(iterations)]
         # As many as were left out, so that none is due later.
-        update = [timed(run.update) for _ in range(iterations)]
+        due = run.schedules.updates_due(run.env_steps) - before
+        updates = [timed(run.update)[0] for _ in range(due)]
         self._forget()
-        return {"iteration": iteration, "acting": acting, "update": update, "busy": [busy]}
+        slower = float(max(np.median(acting), np.median(updates) * due / iterations))
+        return {"rate": [rate], "iteration": iteration, "busy": [busy], "slower half": [slower]}
+
+    def _act(self) -> float:
+        """A step of the loop without updates: milliseconds of acting and of the environments' step."""
+        run = self._run
+        frames = [seed.stacks.observations() for seed in run.seeds]
+        now = run.state.params, frames, run.env_steps, run.now.epsilon
+        milliseconds, steps = run.env_threads.submit(timed, run.act_and_step, *now).result()
+        for seed, step in zip(run.seeds, steps, strict=True):
+            seed.take(step)
+        run.env_steps += run.config.num_envs
+        return milliseconds
 
     def _forget(self) -> None:
         """As after a row."""
         self._run.fetch()
         self._run.seeds[0].report.means.take()
-        self._acting.clear()
 
 
-class Replays:
-    """A full buffer; `setup` comes first."""
+class Replay:
+    """A preset's buffer, full of noise in episodes of about 800 env steps, and its environments."""
 
-    def setup(self, seed: int = 0) -> dict[str, Any]:
-        """Fills a buffer with noise, in episodes of about 800 env steps. Replies with "versions"."""
-        from srl_jax.replay import Replay
-
-        self._rng = rng = np.random.default_rng(seed)
-        self._replay = Replay(
-            capacity=CAPACITY,
-            num_streams=STREAMS,
-            frame_shape=(SIDE, SIDE, 1),
-            stack=STACK,
-            horizon=HORIZON,
-            seed=seed,
+    def __init__(self, preset: str):
+        config = config_of(preset)
+        shape, streams = frame_shape(config), config.num_envs
+        self._rng = rng = np.random.default_rng(0)
+        self._batch = config.batch_size
+        horizon = make_agent(config, shape, NUM_ACTIONS).horizon
+        self._length = config.frame_stack + horizon
+        self._replay = replay.Replay(
+            capacity=config.buffer_size,
+            num_streams=streams,
+            frame_shape=shape,
+            stack=config.frame_stack,
+            horizon=horizon,
+            seed=0,
         )
-        pool = rng.integers(0, 256, (97, STREAMS, SIDE, SIDE, 1), np.uint8)
-        zeros = np.zeros(STREAMS, bool)
+        pool = rng.integers(0, 256, (97, streams, *shape), np.uint8)
+        zeros = np.zeros(streams, bool)
         self._replay.begin(pool[0])
-        for i in range(self._replay.slots + STACK):
-            actions = rng.integers(0, 6, STREAMS)
-            over = rng.random(STREAMS) < 1 / 800
-            self._replay.add(
-                actions, rng.integers(-1, 2, STREAMS).astype(np.float32), over, zeros, zeros, pool[i % 97]
-            )
+        for i in range(self._replay.slots + config.frame_stack):
+            rewards = rng.integers(-1, 2, streams).astype(np.float32)
+            over = rng.random(streams) < 1 / 800
+            self._replay.add(rng.integers(0, 6, streams), rewards, over, zeros, zeros, pool[i % 97])
             if over.any():
                 self._replay.begin(pool[0][over], np.flatnonzero(over))
-        self._frames = self._replay.frames.reshape(-1, SIDE, SIDE, 1)
-        self._env = None
-        self.sample(100)
-        return {"versions": versions()}
+        self._frames = self._replay.frames.reshape(-1, *shape)
+        self._env = envs.make(config.game, num_envs=streams, seed=0)
+        self._replay.begin(self._env.reset()[0])
+        self.turn(100, 10)
 
-    def sample(self, repetitions: int) -> dict[str, Any]:
-        """Draws batches and sets their priorities, in turn with gathering as many frames.
+    def turn(self, samples: int, inserts: int) -> dict[str, list[float]]:
+        """Samples, and adds what random actions give; in milliseconds.
 
-        Returns:
-            Lists of seconds: "sample"; "gather", of one numpy index into the same frames, in runs as long as
-            a window.
-        """
-        sample, gather = [], []
-        length = STACK + HORIZON
-        for _ in range(repetitions):
-            errors = self._rng.random(BATCH)
-
-            def draw(errors=errors):
-                _, indices = self._replay.sample(BATCH, BETA)
-                self._replay.set_priorities(indices, errors)
-
-            sample.append(timed(draw))
-            first = self._rng.integers(0, len(self._frames) - length, BATCH)
-            indices = first[:, None] + np.arange(length)
-            gather.append(timed(lambda indices=indices: self._frames[indices]))
-        return {"sample": sample, "gather": gather}
-
-    def insert(self, steps: int) -> dict[str, Any]:
-        """Steps environments of Pong with random actions, and adds what they give.
+        Args:
+            samples: batches.
+            inserts: steps of all environments.
 
         Returns:
-            Lists of seconds: "step" of all environments, "add".
+            "sample", of drawing a batch and setting its priorities; "gather", of one numpy index into the
+            same frames, in runs as long as a window; "env step" of all environments; "add".
         """
-        if self._env is None:
-            from srl_jax import envs
-
-            self._env = envs.make("Pong", num_envs=STREAMS, seed=0)
-            frames, _ = self._env.reset()
-            self._replay.begin(frames)
-        seconds = {"step": [], "add": []}
-        for _ in range(steps):
-            actions = self._rng.integers(0, 6, STREAMS, np.int32)
-            start = time.perf_counter()
-            frames, rewards, terminated, truncated, info = self._env.step(actions)
-            stepped = time.perf_counter()
-            self._replay.add(actions, rewards, terminated, truncated, info["life_lost"], frames)
-            seconds["add"].append(time.perf_counter() - stepped)
-            seconds["step"].append(stepped - start)
+        found: dict[str, list[float]] = {"sample": [], "gather": [], "env step": [], "add": []}
+        for _ in range(samples):
+            found["sample"].append(timed(self._sample, self._rng.random(self._batch))[0])
+            first = self._rng.integers(0, len(self._frames) - self._length, self._batch)
+            indices = first[:, None] + np.arange(self._length)
+            found["gather"].append(timed(lambda: self._frames[indices])[0])  # noqa: B023
+        for _ in range(inserts):
+            actions = self._rng.integers(0, NUM_ACTIONS, self._env.num_envs, np.int32)
+            milliseconds, step = timed(self._env.step, actions)
+            frames, rewards, terminated, truncated, info = step
+            found["env step"].append(milliseconds)
+            added = actions, rewards, terminated, truncated, info["life_lost"], frames
+            found["add"].append(timed(self._replay.add, *added)[0])
             over = terminated | truncated
             if over.any():
                 frames, _ = self._env.reset(options={"reset_mask": over})
                 self._replay.begin(frames[over], np.flatnonzero(over))
-        return seconds
+        return found
 
-
-if __name__ == "__main__":
-    runtime.prepare("auto", sys.argv[1])
-    loops, replays = Loop(), Replays()
-    serve(
-        {
-            "setup": loops.setup,
-            "run": loops.run,
-            "parts": loops.parts,
-            "fill": replays.setup,
-            "sample": replays.sample,
-            "insert": replays.insert,
-        }
-    )
+    def _sample(self, errors: np.ndarray) -> None:
+        _, indices = self._replay.sample(self._batch, BETA)
+        self._replay.set_priorities(indices, errors)

@@ -1,30 +1,30 @@
-"""This project's side of the benchmarks of updates: timed, and checked; answers `worker` requests.
-
-`python -m experiments.benchmarks.jax_side ENCODER`, in the environment that a run with this encoder gives
-itself. Imports jax when it is first asked.
-"""
+"""This project's updates: timed, and checked; a side of `worker`, and what other benchmarks share."""
 
 import dataclasses
-import sys
 import time
-from pathlib import Path
 from typing import Any
 from unittest import mock
 
+import jax
 import numpy as np
+from flax.traverse_util import flatten_dict
 
-from srl_jax.config import Config, resolve, versions
-from srl_jax.types import TrainState, Window
+from srl_jax import encoders, objectives, rl
+from srl_jax.agent import make_agent, over_seeds
+from srl_jax.config import Config, resolve
+from srl_jax.rl import heads
+from srl_jax.types import Window
 
-from .. import runtime
 from ..presets import PRESETS
-from .worker import serve
 
 NUM_ACTIONS = 6
 """Pong's."""
 
 WINDOWS = 8
 """Different batches that the timed updates take in turn."""
+
+WARM_UPDATES = 5
+"""Updates, or rounds of `srl_every` of them, before any that is timed."""
 
 CHECK_ADAM_EPS = 1e-3
 """Of the checked updates: with a tiny one, Adam's first step is the sign of a gradient, rounding and all."""
@@ -34,9 +34,7 @@ JITTER = 0.003
 
 
 def config_of(preset: str, **overrides: Any) -> Config:
-    """The resolved settings of a preset; imports jax."""
-    from srl_jax import encoders, objectives, rl
-
+    """The resolved settings of a preset."""
     config = Config(**{**PRESETS[preset], **overrides})
     return resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
 
@@ -65,115 +63,81 @@ def random_window(config: Config, horizon: int, seed: int) -> Window:
     )
 
 
-def flat(tree: Any) -> dict[str, np.ndarray]:
-    """A tree of dicts as {path/with/slashes: array}."""
-    import jax
+class Updates:
+    """A preset's jitted update and the state that it moves, compiled and warmed up.
 
-    leaves = jax.tree_util.tree_leaves_with_path(tree)
-    return {"/".join(str(k.key) for k in path): np.array(leaf) for path, leaf in leaves}
+    Attributes:
+        config, agent: of the preset.
+        state: after the updates so far; with an axis of seeds in front where there are several.
+        windows: {seed: batches}, which updates take in turn.
+
+    Args:
+        preset: a key of `experiments.presets.PRESETS`.
+        seeds: in one call.
+        **overrides: fields of `Config`.
+    """
+
+    def __init__(self, preset: str, seeds: int = 1, **overrides: Any):
+        self.config = config_of(preset, **overrides)
+        self.agent = make_agent(self.config, frame_shape(self.config), NUM_ACTIONS)
+        self.device = over_seeds(self.agent, seeds)
+        keys = [jax.random.key(self.config.seed + i) for i in range(seeds)]
+        self.state = self.device.stack([self.agent.init(key, None) for key in keys])
+        self.windows = [random_window(self.config, self.agent.horizon, seed) for seed in range(WINDOWS)]
+        self._seeds, self._count = seeds, 0
+        self.turn(WARM_UPDATES)
+
+    def check(self, updates: int) -> tuple[list[dict[str, float]], dict[str, Any]]:
+        """What another side must reproduce, without noise and on one batch.
+
+        Args:
+            updates: how many.
+
+        Returns:
+            The losses of each, {name: the mean before its weight}, "total" the weighted sum. And what they
+            start from: "params", `TrainState.params` and `.slow` by path, with biases and a slow copy unlike
+            those of a start; "window".
+        """
+        state = self.agent.init(jax.random.key(self.config.seed), None)
+        state = state._replace(params=_jittered(state.params, 1), slow=_jittered(state.slow, 2))
+        given = {
+            "params": flatten_dict(jax.device_get({"params": state.params, "slow": state.slow}), sep="/"),
+            "window": self.windows[0]._asdict(),
+        }
+        # Not the timed update: what is traced here has no noise in it.
+        config = dataclasses.replace(self.config, adam_eps=CHECK_ADAM_EPS)
+        agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
+        found = []
+        with mock.patch.object(heads, "factorised_noise", lambda key, size: np.zeros(size, np.float32)):
+            for _ in range(updates):
+                state, _, metrics = agent.update(state, self.windows[0], agent.hyper)
+                names = [name for name in metrics if name.startswith("loss/")]
+                found.append({name.removeprefix("loss/"): float(metrics[name]) for name in names})
+        return found, given
+
+    def turn(self, updates: int) -> dict[str, list[float]]:
+        """Goes on with so many updates.
+
+        Returns:
+            "update", the milliseconds of each from handing over windows to priorities and state in hand; with
+            `srl_every` the means of so many rounds in which the representation losses run once.
+        """
+        every = self.config.srl_every
+        return {"update": [1e3 * sum(self._update() for _ in range(every)) / every for _ in range(updates)]}
+
+    def _update(self) -> float:
+        update = self.device.update_rl if self._count % self.config.srl_every else self.device.update
+        windows = [self.windows[(self._count + i) % WINDOWS] for i in range(self._seeds)]
+        self._count += 1
+        start = time.perf_counter()
+        self.state, td_error, _ = update(self.state, windows, self.agent.hyper)
+        np.asarray(td_error)
+        jax.block_until_ready(self.state)
+        return time.perf_counter() - start
 
 
 def _jittered(tree: Any, seed: int) -> Any:
     """The tree with a little noise on every number."""
-    import jax
-
     rng = np.random.default_rng(seed)
 
-    def moved(leaf):
-        return jax.numpy.asarray(leaf + rng.normal(0, JITTER, leaf.shape).astype(np.float32))
-
-    return jax.tree.map(moved, tree)
-
-
-class Updates:
-    """One preset's jitted update and the state that it moves; `setup` comes first."""
-
-    def setup(self, preset: str, **overrides: Any) -> dict[str, Any]:
-        """Builds and compiles the update.
-
-        Args:
-            preset: a key of `experiments.presets.PRESETS`.
-            **overrides: fields of `Config`.
-
-        Returns:
-            "versions"; "compile_s", the seconds of the first updates.
-        """
-        import jax
-
-        from srl_jax.agent import make_agent
-
-        self._config = config_of(preset, **overrides)
-        self._agent = make_agent(self._config, frame_shape(self._config), NUM_ACTIONS)
-        self._state = self._agent.init(jax.random.key(self._config.seed), None)
-        self._windows = [self._window(seed) for seed in range(WINDOWS)]
-        self._count = 0
-        start = time.perf_counter()
-        self.time(self._config.srl_every)
-        return {"versions": versions(), "compile_s": time.perf_counter() - start}
-
-    def check(self, folder: str, updates: int) -> dict[str, Any]:
-        """The mean losses of the first updates without noise, before weights, and their weighted sum "total".
-
-        Args:
-            folder: where params.npz (`TrainState.params` and `.slow`, by path) and window.npz are written, so
-                that another side can start from the same. Neither biases nor the slow copy are as at a start.
-            updates: how many, on one batch.
-
-        Returns:
-            "losses", {name: value} of each update; "params" and "window", paths of the files.
-        """
-        from srl_jax.agent import make_agent
-        from srl_jax.rl import heads
-
-        state, window = self._checked_state(), self._window(0)
-        weights = flat({"params": state.params, "slow": state.slow})
-        paths = {name: str(Path(folder) / f"{name}.npz") for name in ("params", "window")}
-        np.savez(paths["params"], **weights)
-        np.savez(paths["window"], **window._asdict())
-        # Not the timed update: what is traced here has no noise in it.
-        config = dataclasses.replace(self._config, adam_eps=CHECK_ADAM_EPS)
-        agent = make_agent(config, frame_shape(config), NUM_ACTIONS)
-        losses = []
-        with mock.patch.object(heads, "factorised_noise", lambda key, size: np.zeros(size, np.float32)):
-            for _ in range(updates):
-                state, _, metrics = agent.update(state, window, agent.hyper)
-                found = {n.removeprefix("loss/"): x for n, x in metrics.items() if n.startswith("loss/")}
-                losses.append({name: float(value) for name, value in found.items()})
-        return {"losses": losses, **paths}
-
-    def time(self, updates: int) -> dict[str, Any]:
-        """Does so many updates, from where the last call left off.
-
-        Where `srl_every` is above 1, the representation losses run in the updates that it divides.
-
-        Returns:
-            "seconds" of each, from handing over the window to priorities and state in hand.
-        """
-        return {"seconds": [self._update() for _ in range(updates)]}
-
-    def _update(self) -> float:
-        import jax
-
-        window = self._windows[self._count % WINDOWS]
-        update = self._agent.update_rl if self._count % self._config.srl_every else self._agent.update
-        self._count += 1
-        start = time.perf_counter()
-        self._state, td_error, _ = update(self._state, window, self._agent.hyper)
-        np.asarray(td_error)
-        jax.block_until_ready(self._state)
-        return time.perf_counter() - start
-
-    def _window(self, seed: int) -> Window:
-        return random_window(self._config, self._agent.horizon, seed)
-
-    def _checked_state(self) -> TrainState:
-        import jax
-
-        state = self._agent.init(jax.random.key(self._config.seed), None)
-        return state._replace(params=_jittered(state.params, 1), slow=_jittered(state.slow, 2))
-
-
-if __name__ == "__main__":
-    runtime.prepare("auto", sys.argv[1])
-    updates = Updates()
-    serve({"setup": updates.setup, "check": updates.check, "time": updates.time})
+    return jax.tree.map(lambda x: x + rng.normal(0, JITTER, x.shape).astype(np.float32), tree)

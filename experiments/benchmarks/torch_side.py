@@ -1,245 +1,100 @@
-"""The update of three arms of the thesis in PyTorch, eager, as its users write it; answers `worker` requests.
+"""The update of three arms of the thesis in PyTorch, eager; a side of `worker`.
 
-`python -m experiments.benchmarks.torch_side`. Parameters and batch come from srl_jax, and without noise the
-losses are srl_jax's (handler `check`), so that what is timed (handler `time`) is the same mathematics. It
-imports nothing of srl_jax: what the two sides share, they state twice.
+Parameters and batch come from srl_jax, and without noise the losses are srl_jax's, so that what is timed is
+the same mathematics. It imports nothing of srl_jax: what the two sides share, they state twice.
 
 Here images are [B, C, H, W] and a flattened image runs over C, H, W; srl_jax has [B, H, W, C] and H, W, C.
 """
 
-import math
-import platform
 import time
-from collections.abc import Iterator
-from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
-from .worker import serve
+STRIDES = {
+    "thesis/rl_only_nature": (4, 2, 1),
+    "thesis/rl_only_256": (2, 1, 1, 1),
+    "thesis/joint_256": (2, 1, 1, 1),
+}
+"""{preset: the strides of its encoder}; all else is seen from the parameters."""
 
 INPUT_GAIN = 32.0  # the presets' option gain
 N_STEP = 3
 ATOMS, V_MIN, V_MAX = 51, -10.0, 10.0
 INIT_STD = 1.0  # the presets' option: of the value distribution at the start, in units of reward
-HIDDEN = 512
 LEARNING_RATE, ADAM_EPS = 1e-4, 1e-8
 CHECK_ADAM_EPS = 1e-3  # see srl_jax' side
 DECODER_WEIGHT_DECAY = 1e-7
 SLOW_UPDATE_EVERY = 500  # updates
 WEIGHTS = {"rl": 1.0, "reconstruction": 1.0, "latent_l2": 1e-6}
+WARM_UPDATES = 5  # a process' first are slower
 
-
-class Arm(NamedTuple):
-    """What distinguishes the arms.
-
-    Attributes:
-        layers: the encoder's convolutions: channels, kernel, stride.
-        features: size of its bottleneck, 0 for none.
-        joint: whether reconstruction and latent L2 are trained beside RL.
-    """
-
-    layers: tuple[tuple[int, int, int], ...]
-    features: int
-    joint: bool
-
-
-_NATURE = ((32, 8, 4), (64, 4, 2), (64, 3, 1))
-_SAC_AE = ((32, 3, 2), (32, 3, 1), (32, 3, 1), (32, 3, 1))
-ARMS = {
-    "rl_only_nature": Arm(_NATURE, 0, False),
-    "rl_only_256": Arm(_SAC_AE, 256, False),
-    "joint_256": Arm(_SAC_AE, 256, True),
-}
-
-
-class Encoder(nn.Module):
-    """float32 [B, S, H, W] in [0, 1] -> latents [B, D]; without a bottleneck, the flattened maps.
-
-    Attributes:
-        maps: (C, H, W) of the last convolution's output.
-    """
-
-    def __init__(self, arm: Arm, channels: int, sizes: list[int]):
-        super().__init__()
-        inputs = [channels] + [layer[0] for layer in arm.layers]
-        self.convs = nn.ModuleList(
-            nn.Conv2d(i, o, k, s) for i, (o, k, s) in zip(inputs, arm.layers, strict=False)
-        )
-        self.maps = (inputs[-1], sizes[-1], sizes[-1])
-        self.bottleneck = None
-        self.features = math.prod(self.maps)
-        if arm.features:
-            self.bottleneck = nn.Sequential(
-                nn.Linear(self.features, arm.features), nn.LayerNorm(arm.features, eps=1e-5), nn.Tanh()
-            )
-            self.features = arm.features
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        x = pixels * INPUT_GAIN
-        for conv in self.convs:
-            x = F.relu(conv(x))
-        x = x.flatten(1)
-        return x if self.bottleneck is None else self.bottleneck(x)
-
-
-class Decoder(nn.Module):
-    """The mirror of an `Encoder` with a bottleneck: [B, D] -> float32 [B, S, H, W], linear at the end."""
-
-    def __init__(self, arm: Arm, channels: int, sizes: list[int], maps: tuple[int, int, int]):
-        super().__init__()
-        self.maps = maps
-        self.linear = nn.Linear(arm.features, math.prod(maps))
-        outputs = [channels] + [layer[0] for layer in arm.layers[:-1]]
-        self.convs = nn.ModuleList()
-        for i in reversed(range(len(arm.layers))):
-            inputs, kernel, stride = arm.layers[i]
-            padding = sizes[i] - ((sizes[i + 1] - 1) * stride + kernel)
-            self.convs.append(nn.ConvTranspose2d(inputs, outputs[i], kernel, stride, output_padding=padding))
-
-    def forward(self, z: Tensor) -> Tensor:
-        x = F.relu(self.linear(z)).view(-1, *self.maps)
-        for conv in self.convs[:-1]:
-            x = F.relu(conv(x))
-        return self.convs[-1](x)
-
-
-class NoisyLinear(nn.Module):
-    """A linear layer with factorised Gaussian noise (Fortunato et al. 2018); in eval mode with its means.
-
-    `reset_noise` draws e, one for all batches until the next: `f(e) = sign(e) sqrt|e|`.
-    """
-
-    def __init__(self, inputs: int, outputs: int):
-        super().__init__()
-        for name, shape in (("weight", (outputs, inputs)), ("bias", (outputs,))):
-            setattr(self, f"{name}_mu", nn.Parameter(torch.zeros(shape)))
-            setattr(self, f"{name}_sigma", nn.Parameter(torch.zeros(shape)))
-            self.register_buffer(f"{name}_epsilon", torch.zeros(shape))
-
-    def reset_noise(self) -> None:
-        outputs, inputs = self.weight_mu.shape
-        noise_in, noise_out = _signed_sqrt(torch.randn(inputs)), _signed_sqrt(torch.randn(outputs))
-        self.weight_epsilon.copy_(torch.outer(noise_out, noise_in))
-        self.bias_epsilon.copy_(noise_out)
-
-    def forward(self, x: Tensor) -> Tensor:
-        if not self.training:
-            return F.linear(x, self.weight_mu, self.bias_mu)
-        weight = self.weight_mu + self.weight_sigma * self.weight_epsilon
-        return F.linear(x, weight, self.bias_mu + self.bias_sigma * self.bias_epsilon)
-
-
-def _signed_sqrt(x: Tensor) -> Tensor:
-    return x.sign() * x.abs().sqrt()
-
-
-class QNetwork(nn.Module):
-    """Rainbow's head: latents [B, D] -> logits [B, A, M], dueling and noisy.
-
-    The prior is the logits of a normal around 0, added to the state's.
-    """
-
-    def __init__(self, features: int, num_actions: int):
-        super().__init__()
-        self.num_actions = num_actions
-        self.q_hidden = NoisyLinear(features, HIDDEN)
-        self.q_out = NoisyLinear(HIDDEN, num_actions * ATOMS)
-        self.v_hidden = NoisyLinear(features, HIDDEN)
-        self.v_out = NoisyLinear(HIDDEN, ATOMS)
-        self.register_buffer("prior", -0.5 * (_support() / INIT_STD) ** 2, persistent=False)
-
-    def forward(self, z: Tensor) -> Tensor:
-        q = self.q_out(F.relu(self.q_hidden(z))).view(-1, self.num_actions, ATOMS)
-        v = self.v_out(F.relu(self.v_hidden(z))).view(-1, 1, ATOMS)
-        return q - q.mean(1, keepdim=True) + v + self.prior
-
-    def reset_noise(self) -> None:
-        for layer in (self.q_hidden, self.q_out, self.v_hidden, self.v_out):
-            layer.reset_noise()
-
-
-class Network(nn.Module):
-    """Encoder and head: what has a slow copy."""
-
-    def __init__(self, arm: Arm, channels: int, sizes: list[int], num_actions: int):
-        super().__init__()
-        self.encoder = Encoder(arm, channels, sizes)
-        self.head = QNetwork(self.encoder.features, num_actions)
-
-    def forward(self, pixels: Tensor) -> Tensor:
-        return self.head(self.encoder(pixels))
+ENCODER, HEAD, DECODER = "params/encoder", "params/rl", "params/reconstruction"
+SLOW = {ENCODER: "slow/rl/encoder", HEAD: "slow/rl/head"}
+"""{parameters: their slow copy}."""
 
 
 class Learner:
-    """The networks of an arm, their optimizer, and the update."""
+    """The networks of a preset, their optimizers, and the update.
+
+    Args:
+        params: srl_jax's `TrainState.params` and `.slow`, by path.
+        window: srl_jax's `Window`, with grey frames uint8 [B, S + K, H, W, 1]; the batch of all updates.
+        strides: the encoder's.
+        memory_format: of images and kernels.
+        separate: whether, in joint training, RL's Adam steps first, then the representation's own on the same
+            batch, encoded anew, as the thesis' code does; else one Adam steps on the sum of the losses.
+        noise: whether the head's layers have noise.
+        adam_eps: Adam's epsilon.
+    """
 
     def __init__(
         self,
-        arm: str,
         params: dict[str, np.ndarray],
         window: dict[str, np.ndarray],
-        num_actions: int,
+        strides: tuple[int, ...],
         memory_format: torch.memory_format,
-        encoder_optimizer: str,
+        separate: bool,
+        noise: bool,
         adam_eps: float = ADAM_EPS,
     ):
-        """Builds everything.
+        self.window = window | {"frames": window["frames"][..., 0]}
+        self.stack = window["frames"].shape[1] - window["actions"].shape[1]
+        self.strides, self.memory_format, self.noisy, self.steps = strides, memory_format, noise, 0
+        self.sizes = [window["frames"].shape[2]]
+        for i, stride in enumerate(strides):
+            kernel = params[f"{ENCODER}/Conv_{i}/kernel"]
+            self.sizes.append((self.sizes[-1] - len(kernel)) // stride + 1)
+        self.maps = (kernel.shape[-1], self.sizes[-1], self.sizes[-1])
+        self.params = {path: self._in_torchs_order(path, array) for path, array in params.items()}
+        self.noise: dict[str, tuple[Tensor, Tensor]] = {}
+        encoder, head, decoder = (
+            [x.requires_grad_() for path, x in self.params.items() if path.startswith(group)]
+            for group in (ENCODER, HEAD, DECODER)
+        )
+        groups = [[{"params": encoder + head}]]
+        if decoder:
+            if separate:
+                groups.append([{"params": encoder}])
+            groups[-1].append({"params": decoder, "weight_decay": DECODER_WEIGHT_DECAY})
+        self.optimizers = [torch.optim.Adam(some, lr=LEARNING_RATE, eps=adam_eps) for some in groups]
+        self.joint = bool(decoder)
+        self.support = torch.linspace(V_MIN, V_MAX, ATOMS)
+        self.prior = -0.5 * (self.support / INIT_STD) ** 2
 
-        Args:
-            arm: a key of `ARMS`.
-            params: srl_jax's `TrainState.params` and `.slow`, by path.
-            window: srl_jax's `Window`, grey frames uint8 [B, S + K, H, W, 1] and the rest: one batch for all
-                updates.
-            num_actions: A.
-            memory_format: of images and kernels.
-            encoder_optimizer: "summed": one Adam on the sum of the losses; "separate": RL's Adam steps, then
-                the representation's own on the same batch, encoded anew, as the thesis' code does.
-            adam_eps: Adam's epsilon.
-
-        Raises:
-            ValueError: parameters that do not fit the arm.
-        """
-        layers = ARMS[arm].layers
-        window = window | {"frames": window["frames"][..., 0]}
-        channels = window["frames"].shape[1] - window["actions"].shape[1]
-        sizes = [window["frames"].shape[-1]]
-        for _, kernel, stride in layers:
-            sizes.append((sizes[-1] - kernel) // stride + 1)
-        self.window, self.stack, self.memory_format = window, channels, memory_format
-        self.online = Network(ARMS[arm], channels, sizes, num_actions)
-        self.slow = Network(ARMS[arm], channels, sizes, num_actions).requires_grad_(False)
-        self.decoder = None
-        left = dict(params)
-        _load(self.online, left, "params/encoder", "params/rl")
-        _load(self.slow, left, "slow/rl/encoder", "slow/rl/head")
-        groups: list[dict[str, Any]] = [{"params": list(self.online.parameters())}]
-        second: list[dict[str, Any]] = []
-        if ARMS[arm].joint:
-            self.decoder = Decoder(ARMS[arm], channels, sizes, self.online.encoder.maps)
-            _load_decoder(self.decoder, left)
-            self.decoder.to(memory_format=memory_format)
-            decoder = {"params": list(self.decoder.parameters()), "weight_decay": DECODER_WEIGHT_DECAY}
-            if encoder_optimizer == "separate":
-                second = [{"params": list(self.online.encoder.parameters())}, decoder]
-            else:
-                groups.append(decoder)
-        if left:
-            raise ValueError(f"{arm} has no {', '.join(sorted(left))}")
-        self.online.to(memory_format=memory_format)
-        self.slow.to(memory_format=memory_format)
-        self.parameters = list({p for group in groups + second for p in group["params"]})
-        self.optimizer = torch.optim.Adam(groups, lr=LEARNING_RATE, eps=adam_eps)
-        self.second = torch.optim.Adam(second, lr=LEARNING_RATE, eps=adam_eps) if second else None
-        self.support = _support()
-        self.steps = 0
-
-    def noise(self, on: bool) -> None:
-        """Has noisy layers act with noise, or with their means."""
-        self.online.train(on)
-        self.slow.train(on)
+    def _in_torchs_order(self, path: str, value: np.ndarray) -> Tensor:
+        """A parameter of srl_jax as PyTorch's functions take it."""
+        channels, height, width = self.maps
+        if value.ndim == 4:
+            value = value.transpose((2, 3, 0, 1) if "ConvTranspose" in path else (3, 2, 0, 1))
+        elif len(value) == channels * height * width:  # rows in the order H, W, C
+            value = value.reshape(height, width, channels, -1).transpose(2, 0, 1, 3).reshape(value.shape)
+        if value.ndim == 2 and "WideDense" not in path:  # which is [outputs, inputs] on both sides
+            value = value.T
+        found = torch.from_numpy(np.array(value, np.float32, order="C"))
+        return found.to(memory_format=self.memory_format) if value.ndim == 4 else found
 
     def update(self) -> tuple[np.ndarray, dict[str, Tensor]]:
         """One update on the batch: a gradient step, or two.
@@ -250,46 +105,103 @@ class Learner:
             loss, their weighted sum "total" and the mean of the largest value of s_t.
         """
         batch = {name: torch.from_numpy(array) for name, array in self.window.items()}
-        if self.online.training:
-            self.online.head.reset_noise()
-            self.slow.head.reset_noise()
+        if self.noisy:
+            self._draw_noise()
         r_t, discount_t, offset = n_step(batch["rewards"], batch["discounts"], batch["valid"])
         pixels_tm1 = self._pixels(batch["frames"][:, : self.stack])
         pixels_t = self._pixels(_stack_at(batch["frames"], offset, self.stack))
 
-        z_tm1 = self.online.encoder(pixels_tm1)
-        logits_tm1 = self.online.head(z_tm1)
+        z_tm1 = self._encode(ENCODER, pixels_tm1)
+        logits_tm1 = self._logits(HEAD, z_tm1)
         with torch.no_grad():
-            selector_t = self.online(pixels_t).softmax(-1) @ self.support
-            target = self._target(self.slow(pixels_t), selector_t.argmax(-1), r_t, discount_t)
+            selector_t = self._logits(HEAD, self._encode(ENCODER, pixels_t)).softmax(-1) @ self.support
+            slow_logits_t = self._logits(SLOW[HEAD], self._encode(SLOW[ENCODER], pixels_t))
+            target = self._target(slow_logits_t, selector_t.argmax(-1), r_t, discount_t)
         rows = torch.arange(len(r_t))
         cross_entropy = -(target * logits_tm1[rows, batch["actions"][:, 0]].log_softmax(-1)).sum(-1)
 
         losses = {"rl": (cross_entropy * batch["weight"]).mean()}
-        if self.second is not None:
-            self._step(self.optimizer, losses)
-            later = self._representation(self.online.encoder(pixels_tm1), pixels_tm1)
-            self._step(self.second, later)
+        first, *second = self.optimizers
+        if second:
+            self._step(first, losses)
+            later = self._representation(self._encode(ENCODER, pixels_tm1), pixels_tm1)
+            self._step(*second, later)
             losses |= later
         else:
-            if self.decoder is not None:
+            if self.joint:
                 losses |= self._representation(z_tm1, pixels_tm1)
-            self._step(self.optimizer, losses)
-        total = sum(WEIGHTS[name] * loss.detach() for name, loss in losses.items())
+            self._step(first, losses)
         self.steps += 1
-        if self.steps % SLOW_UPDATE_EVERY == 0:
-            self.slow.load_state_dict(self.online.state_dict())
-
         with torch.no_grad():
+            if self.steps % SLOW_UPDATE_EVERY == 0:
+                for path, value in self.params.items():
+                    for group, slow in SLOW.items():
+                        if path.startswith(group):
+                            self.params[path.replace(group, slow)].copy_(value)
             entropy = -(target * target.clamp(min=1e-30).log()).sum(-1)
             td_error = (cross_entropy - entropy).clamp(min=0).numpy()
+            total = sum(WEIGHTS[name] * loss for name, loss in losses.items())
             q_max = (logits_tm1.softmax(-1) @ self.support).amax(-1).mean()
         metrics = {name: loss.detach() for name, loss in losses.items()}
         return td_error, metrics | {"total": total, "q_max": q_max}
 
+    # Networks, by the path of their parameters
+
+    def _encode(self, path: str, pixels: Tensor) -> Tensor:
+        """float32 [B, S, H, W] in [0, 1] -> latents [B, D]; without a bottleneck, the flattened maps."""
+        x = pixels * INPUT_GAIN
+        for i, stride in enumerate(self.strides):
+            x = F.relu(F.conv2d(x, *self._layer(f"{path}/Conv_{i}"), stride))
+        x = x.flatten(1)
+        if f"{path}/Dense_0/kernel" in self.params:
+            x = F.linear(x, *self._layer(f"{path}/Dense_0"))
+            x = F.layer_norm(x, x.shape[1:], *self._layer(f"{path}/LayerNorm_0", "scale"), eps=1e-5).tanh()
+        return x
+
+    def _decode(self, z: Tensor) -> Tensor:
+        """The mirror of an encoder with a bottleneck: [B, D] -> float32 [B, S, H, W], linear at the end."""
+        x = F.linear(z, *self._layer(f"{DECODER}/WideDense_0")).view(-1, *self.maps)
+        for i, stride in enumerate(reversed(self.strides)):
+            kernel, bias = self._layer(f"{DECODER}/ConvTranspose_{i}")
+            smaller, size = self.sizes[-1 - i], self.sizes[-2 - i]
+            padding = size - ((smaller - 1) * stride + kernel.shape[-1])
+            x = F.conv_transpose2d(F.relu(x), kernel, bias, stride, output_padding=padding)
+        return x
+
+    def _logits(self, path: str, z: Tensor) -> Tensor:
+        """Rainbow's head: latents [B, D] -> logits [B, A, M], dueling and noisy.
+
+        The prior is the logits of a normal around 0, added to the state's.
+        """
+        q = self._noisy(f"{path}/q_out", F.relu(self._noisy(f"{path}/q_hidden", z))).unflatten(1, (-1, ATOMS))
+        v = self._noisy(f"{path}/v_out", F.relu(self._noisy(f"{path}/v_hidden", z))).unflatten(1, (1, ATOMS))
+        return q - q.mean(1, keepdim=True) + v + self.prior
+
+    def _noisy(self, path: str, x: Tensor) -> Tensor:
+        """A linear layer with factorised Gaussian noise (Fortunato et al. 2018)."""
+        kernel, bias = self._layer(path)
+        if self.noisy:
+            of_kernel, of_bias = self.noise[path]
+            kernel = kernel + self.params[f"{path}/kernel_sigma"] * of_kernel
+            bias = bias + self.params[f"{path}/bias_sigma"] * of_bias
+        return F.linear(x, kernel, bias)
+
+    def _draw_noise(self) -> None:
+        """Draws e, one for all batches until the next: `f(e) = sign(e) sqrt|e|`."""
+        for path, sigma in self.params.items():
+            if path.endswith("/kernel_sigma"):
+                noise = [torch.randn(size) for size in sigma.shape]
+                outputs, inputs = (e.sign() * e.abs().sqrt() for e in noise)
+                self.noise[path.removesuffix("/kernel_sigma")] = torch.outer(outputs, inputs), outputs
+
+    def _layer(self, path: str, kernel: str = "kernel") -> tuple[Tensor, Tensor]:
+        return self.params[f"{path}/{kernel}"], self.params[f"{path}/bias"]
+
+    # Losses
+
     def _representation(self, z: Tensor, pixels: Tensor) -> dict[str, Tensor]:
         return {
-            "reconstruction": F.mse_loss(self.decoder(z), pixels),
+            "reconstruction": F.mse_loss(self._decode(z), pixels),
             "latent_l2": 0.5 * z.square().sum(-1).mean(),
         }
 
@@ -330,132 +242,39 @@ def _stack_at(frames: Tensor, offset: Tensor, size: int) -> Tensor:
     return frames[torch.arange(len(frames))[:, None], offset[:, None] + torch.arange(size)]
 
 
-def _support() -> Tensor:
-    return torch.linspace(V_MIN, V_MAX, ATOMS)
+class Updates:
+    """A preset's update; `check` comes first.
 
+    Args:
+        preset: a key of `STRIDES`.
+        threads: PyTorch's.
+        memory_format: "contiguous_format" or "channels_last".
+        encoder_optimizer: "separate" or "summed", see `Learner`.
+    """
 
-def _load(network: Network, params: dict[str, np.ndarray], prefix: str, head: str) -> None:
-    """Copies an encoder and its RL head, of these paths, and takes what it copied out of params."""
-    encoder, maps = network.encoder, network.encoder.maps
-    for i, conv in enumerate(encoder.convs):
-        _load_conv(conv, params, f"{prefix}/Conv_{i}", (3, 2, 0, 1))
-    if encoder.bottleneck is not None:
-        linear, norm, _ = encoder.bottleneck
-        name = f"{prefix}/Dense_0"
-        _set(linear.weight, _rows_chw(params.pop(f"{name}/kernel"), maps).T)
-        _set(linear.bias, params.pop(f"{name}/bias"))
-        name = f"{prefix}/LayerNorm_0"
-        _set(norm.weight, params.pop(f"{name}/scale"))
-        _set(norm.bias, params.pop(f"{name}/bias"))
-    for layer in ("q_hidden", "q_out", "v_hidden", "v_out"):
-        noisy, name = getattr(network.head, layer), f"{head}/{layer}"
-        for ours, theirs in (("mu", ""), ("sigma", "_sigma")):
-            kernel = params.pop(f"{name}/kernel{theirs}")
-            if layer.endswith("hidden") and encoder.bottleneck is None:
-                kernel = _rows_chw(kernel, maps)
-            _set(getattr(noisy, f"weight_{ours}"), kernel.T)
-            _set(getattr(noisy, f"bias_{ours}"), params.pop(f"{name}/bias{theirs}"))
-
-
-def _load_decoder(decoder: Decoder, params: dict[str, np.ndarray]) -> None:
-    """As `_load`, a decoder."""
-    name = "params/reconstruction"
-    _set(decoder.linear.weight, _rows_chw(params.pop(f"{name}/WideDense_0/kernel"), decoder.maps))
-    _set(decoder.linear.bias, _rows_chw(params.pop(f"{name}/WideDense_0/bias"), decoder.maps))
-    for i, conv in enumerate(decoder.convs):
-        _load_conv(conv, params, f"{name}/ConvTranspose_{i}", (2, 3, 0, 1))
-
-
-def _load_conv(conv: nn.Module, params: dict[str, np.ndarray], name: str, axes: tuple[int, ...]) -> None:
-    _set(conv.weight, params.pop(f"{name}/kernel").transpose(axes))
-    _set(conv.bias, params.pop(f"{name}/bias"))
-
-
-def _rows_chw(array: np.ndarray, maps: tuple[int, int, int]) -> np.ndarray:
-    """Rows in the order H, W, C -> in the order C, H, W; [H * W * C, ...]."""
-    channels, height, width = maps
-    rows = array.reshape(height, width, channels, -1).transpose(2, 0, 1, 3)
-    return rows.reshape(array.shape)
-
-
-def _set(parameter: nn.Parameter, value: np.ndarray) -> None:
-    if parameter.shape != value.shape:
-        raise ValueError(f"a parameter of {tuple(parameter.shape)} cannot hold {value.shape}")
-    with torch.no_grad():
-        parameter.copy_(torch.from_numpy(np.array(value, np.float32, order="C")))
-
-
-def _read(path: str) -> dict[str, np.ndarray]:
-    with np.load(path, allow_pickle=False) as arrays:
-        return dict(arrays)
-
-
-class Side:
-    """The handlers; `setup` comes first."""
-
-    def setup(
-        self,
-        arm: str,
-        params: str,
-        window: str,
-        threads: int = 2,
-        memory_format: str = "contiguous",
-        num_actions: int = 6,
-        encoder_optimizer: str = "separate",
-    ) -> dict[str, Any]:
-        """Builds an arm's learner.
-
-        Args:
-            arm: a key of `ARMS`.
-            params: path of an .npz of srl_jax's parameters by path, as `params/encoder/Conv_0/kernel`.
-            window: path of an .npz of srl_jax's `Window`.
-            threads: PyTorch's.
-            memory_format: "contiguous" or "channels_last".
-            num_actions: A.
-            encoder_optimizer: see `Learner`.
-
-        Returns:
-            "versions" of PyTorch and Python; "parameters", how many numbers are trained.
-        """
-        formats = {"contiguous": torch.contiguous_format, "channels_last": torch.channels_last}
+    def __init__(self, preset: str, threads: int, memory_format: str, encoder_optimizer: str = "separate"):
         torch.set_num_threads(threads)
         torch.manual_seed(0)
-        self._arguments = (
-            arm, _read(params), _read(window), num_actions, formats[memory_format], encoder_optimizer,
-        )  # fmt: skip
-        self._learner = Learner(*self._arguments)
-        versions = {"torch": torch.__version__, "python": platform.python_version()}
-        return {"versions": versions, "parameters": sum(p.numel() for p in self._learner.parameters)}
+        self._of_side = STRIDES[preset], getattr(torch, memory_format), encoder_optimizer == "separate"
 
-    def check(self, updates: int = 2) -> dict[str, Any]:
-        """The mean losses of the first updates without noise, before weights, and their weighted sum "total".
+    def check(self, params: dict, window: dict, updates: int) -> list[dict[str, float]]:
+        """The losses of the first updates without noise; makes and warms up another learner, which is timed.
 
-        From the parameters that setup was given, on networks of its own.
+        Args:
+            params, window: see `Learner`.
+            updates: how many.
         """
-        learner = Learner(*self._arguments, CHECK_ADAM_EPS)
-        learner.noise(False)
-        return {"losses": [self._losses(learner) for _ in range(updates)]}
+        checked = Learner(params, window, *self._of_side, noise=False, adam_eps=CHECK_ADAM_EPS)
+        found = [checked.update()[1] for _ in range(updates)]
+        self._learner = Learner(params, window, *self._of_side, noise=True)
+        self.turn(WARM_UPDATES)
+        return [{name: x.item() for name, x in losses.items() if name != "q_max"} for losses in found]
 
-    def time(self, updates: int) -> dict[str, Any]:
-        """Does so many updates with noise, from where the last call left off; a process' first are slower.
-
-        Returns:
-            "seconds" of each, by the wall clock.
-        """
-        self._learner.noise(True)
-        return {"seconds": list(self._timed(updates))}
-
-    def _losses(self, learner: Learner) -> dict[str, float]:
-        _, metrics = learner.update()
-        return {name: value.item() for name, value in metrics.items() if name in WEIGHTS or name == "total"}
-
-    def _timed(self, updates: int) -> Iterator[float]:
+    def turn(self, updates: int) -> dict[str, list[float]]:
+        """Goes on with so many updates. Returns "update", the milliseconds of each."""
+        found = []
         for _ in range(updates):
             start = time.perf_counter()
             self._learner.update()
-            yield time.perf_counter() - start
-
-
-if __name__ == "__main__":
-    side = Side()
-    serve({"setup": side.setup, "check": side.check, "time": side.time})
+            found.append(1e3 * (time.perf_counter() - start))
+        return {"update": found}

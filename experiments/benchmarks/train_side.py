@@ -1,82 +1,85 @@
-"""Whole runs of experiments.train, for their start and their memory; answers `worker` requests.
+"""Whole runs of experiments.train, for their start and their memory; two sides of `worker`.
 
-`python -m experiments.benchmarks.train_side`. Each request runs processes of its own.
+`python -m experiments.benchmarks.train_side`, with train's flags, ends after its first update.
 """
 
+import functools
 import os
+import resource
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
-from typing import Any
 
-from .startup import MARK
-from .worker import ROOT, serve
-
-STEPS = 105_000
-"""Env steps of the run whose memory is measured; its buffer is then full."""
-
-FRAMES_BYTES = 100_000 * 84 * 84
-"""What the frames of a full buffer take by themselves."""
+from .. import flags as config_flags
+from .. import runtime, train
+from .worker import ROOT
 
 
-class Ended(RuntimeError):
-    """A run that went wrong."""
-
-
-def run(module: str, flags: Sequence[str]) -> tuple[float, int, str]:
-    """Runs a module of this project to its end, with a run directory that is deleted afterwards.
-
-    Returns:
-        Seconds, the largest resident size in bytes, and the last line that it printed.
+def run(module: str, **flags: object) -> float:
+    """Runs a module to its end, with a run directory that is deleted afterwards. Returns seconds.
 
     Raises:
-        Ended: its exit status was not 0.
+        ChildProcessError: its exit status was not 0.
     """
-    with tempfile.TemporaryDirectory() as folder, tempfile.TemporaryFile("w+", encoding="utf-8") as log:
-        command = [sys.executable, "-m", module, *flags, f"--out={folder}/run"]
+    with tempfile.TemporaryDirectory() as folder:
+        given = [f"--{name}={value}" for name, value in flags.items()]
+        command = [sys.executable, "-m", module, *given, f"--out={folder}/run"]
         start = time.perf_counter()
-        process = subprocess.Popen(
-            command, cwd=ROOT, stdin=subprocess.DEVNULL, stdout=log, stderr=subprocess.STDOUT
-        )
-        _, status, usage = os.wait4(process.pid, 0)
+        done = subprocess.run(command, cwd=ROOT, stdin=subprocess.DEVNULL, capture_output=True, text=True)
         seconds = time.perf_counter() - start
-        process.returncode = os.waitstatus_to_exitcode(status)
-        log.seek(0)
-        lines = [line.strip() for line in log.read().splitlines() if line.strip()] or [""]
-        if process.returncode:
-            raise Ended(f"{module}: exit status {process.returncode}: {lines[-1]}")
-        kilobyte = 1 if sys.platform == "darwin" else 1024
-        return seconds, usage.ru_maxrss * kilobyte, lines[-1]
+    if done.returncode:
+        raise ChildProcessError(f"{module}: {done.stderr.strip().splitlines()[-1:]}")
+    return seconds
 
 
-def startup(preset: str) -> dict[str, Any]:
-    """Starts training a preset. Replies with "seconds" until the first update has ended."""
-    seconds, _, line = run("experiments.benchmarks.startup", [f"--preset={preset}"])
-    if line != MARK:
-        raise Ended(f"no update was reached: {line}")
-    return {"seconds": [seconds]}
+class Startup:
+    """Starts of a preset. The first one fills jax' cache."""
+
+    def __init__(self, preset: str):
+        self._preset = preset
+        self.turn()
+
+    def turn(self) -> dict[str, list[float]]:
+        """Starts once. Returns "seconds" until the first update has ended."""
+        return {"seconds": [run(__name__, preset=self._preset)]}
 
 
-def memory(preset: str, updates_per_step: float) -> dict[str, Any]:
-    """Trains a preset until its buffer is full.
+class Memory:
+    """A run of a preset, with fewer updates than usual, so that it takes two minutes."""
 
-    Args:
-        preset: a key of `experiments.presets.PRESETS`.
-        updates_per_step: fewer than usual, so that it takes a minute or two.
+    def __init__(self, preset: str):
+        self._flags = {"preset": preset, "updates_per_step": 0.005, "eval_games": 2}
 
-    Returns:
-        "bytes", the largest resident size; "frames", FRAMES_BYTES.
-    """
-    flags = [
-        f"--preset={preset}",
-        f"--steps={STEPS}",
-        f"--updates_per_step={updates_per_step}",
-        "--eval_games=2",
-    ]
-    return {"bytes": [run("experiments.train", flags)[1]], "frames": [FRAMES_BYTES]}
+    def turn(self, buffer_size: int) -> dict[str, list[float]]:
+        """Trains until the buffer is full.
+
+        Args:
+            buffer_size: in transitions of 84 x 84 bytes.
+
+        Returns:
+            "peak", the largest resident size in GB; "frames", what the frames of a full buffer take alone.
+        """
+        run("experiments.train", steps=int(1.05 * buffer_size), buffer_size=buffer_size, **self._flags)
+        unit = 1 if sys.platform == "darwin" else 1024  # bytes
+        memory = unit * resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss
+        return {"peak": [memory / 1e9], "frames": [buffer_size * 84 * 84 / 1e9]}
+
+
+def prepare(tune: str, encoder: str) -> None:
+    """As `runtime.prepare`; the run that follows ends after its first update."""
+    runtime.prepare(tune, encoder)
+    from srl_jax.loop import Run
+
+    update = Run.update
+
+    def once(self) -> None:
+        update(self)
+        os._exit(0)
+
+    Run.update = once
 
 
 if __name__ == "__main__":
-    serve({"startup": startup, "memory": memory})
+    train.define_flags()
+    config_flags.run(functools.partial(train.main, prepare=prepare))

@@ -1,54 +1,71 @@
-"""The pictures of a report, in their sections."""
+"""The pictures of a report: of what is measured over env steps, and of what the runs' directories hold."""
 
+import csv
+import fnmatch
 import functools
+import importlib.resources
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from srl_jax import statistics
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
+from srl_jax.reading import parse_json
 
-from .. import collect, diagnostic_plots, plots
+from .. import plots, run_figures
 from ..collect import RunData
-from ..directories import natural
-from . import diagnostics, numbers, pictures
-from .contents import Content, Report, run_name
-from .markup import Markup, breakable, details, figure, listed, plural, tag
+from ..colours import Style
+from ..run_data import natural
+from . import numbers, pictures, readme
+from .pictures import Curve, Picture
 
-MEDIA_BYTES = 5_000_000
+MEDIA_BYTES = 600_000
 """Of pictures taken from the runs, in all; base64 adds a third."""
-LARGEST_PICTURE, SMALLEST_PICTURE = 400_000, 30_000
+LARGEST_PICTURE, SMALLEST_PICTURE = 120_000, 8_000
 """Bytes that one of them may have where there are few, and may always have."""
 OWN = ("learning_curve", "losses", "diagnostics", "drift")
 """Pictures of a run that a report draws itself."""
+MANY = pictures.ARMS_A_PICTURE
+"""Arms up to which a picture of all of them can be read."""
+SIZE = (4.4, 3.1)
+"""Inches of a picture of a whole section: wide enough for many lines, and legible on a phone."""
+FAINT = "50"
+"""The opacity of a single seed's line, in hexadecimal."""
+Looks = Mapping[str, Style]
+"""arm -> how it is drawn, on the whole page."""
 
 
-def figures(report: Report) -> Content:
-    """What experiments.figures has drawn, with the title and the question beside it."""
-    found = []
-    paths = [sorted((x / "figures").glob("*.png"), key=lambda p: natural(p.name)) for x in report.roots]
-    for path in itertools.chain(*paths):
-        picture = pictures.taken(path, pictures.LARGEST)
-        about = _beside(path.with_suffix(".json"))
-        title, question = (str(about.get(key) or "") for key in ("title", "question"))
-        name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
-        caption = [tag("strong", name), f" {question}"]
-        found.append(figure(picture.source, caption, name, picture.size))
-    return tag("div", found, class_="grid wide") if found else None
+class Shown(NamedTuple):
+    """A picture on the page.
+
+    Attributes:
+        alt: what a reader who does not see it is told.
+        title, caption: below it.
+        arms: of its legend, where it has one: an arm for each of its runs.
+        first: whether it is shown at once; others are shown when they are asked for.
+    """
+
+    picture: Picture
+    alt: str
+    title: str = ""
+    caption: str = ""
+    arms: Sequence[str] = ()
+    first: bool = True
 
 
-def _beside(path: Path) -> dict[str, Any]:
+def beside(path: Path) -> dict[str, Any]:
+    """The numbers of a figure, which lie beside its picture; empty where there are none.
+
+    Raises:
+        ConfigError: they cannot be read, or are no JSON object.
+    """
+    path = path.with_suffix(".json")
     try:
-        values = parse_json(read_bytes(path, SETTINGS))
-    except FileNotFoundError:
-        return {}
-    except OSError as error:
-        raise ConfigError(f"{path}: {error.strerror}") from None
+        values = parse_json(readme.text_of(path) or "{}")
     except ValueError as error:
         raise ConfigError(f"{path}: not JSON: {error}") from None
     if not isinstance(values, dict):
@@ -56,193 +73,177 @@ def _beside(path: Path) -> dict[str, Any]:
     return values
 
 
-def learning_curves(report: Report) -> Content:
-    """A picture a game; of the baseline and a few arms each, where there are many."""
-    drawn = []
-    for game, comparison in report.comparisons.items():
-        if comparison is None:
-            continue
-        policies = {name: row.return_mean for name, row in reference_policies(game).items()}
-        arms = [arm for arm in report.arms if arm in comparison.returns]
-        curves = {}
-        for arm in arms:
-            interval = statistics.curve_interval(comparison.returns[arm])
-            curves[arm] = pictures.Curve(comparison.steps, *interval[:3])
-        limits = pictures.heights(curves.values(), policies.values())  # the same in all pictures of a game
-        for group in groups(arms, report.baseline):
-            lines = [(report.styles[arm], curves[arm]) for arm in group]
-            how = {"label": "mean return", "across": plots.steps_label(game), "size": (5.4, 3.5)}
-            picture = pictures.curves(game, lines, policies=policies, limits=limits, **how)
-            caption = _legend(report, {arm: len(comparison.returns[arm]) for arm in group})
-            drawn.append(figure(picture.source, caption, f"{game}: learning curves", picture.size))
-    if not drawn:
-        return None
-    left_out = [f" {game}, {line}." for game in report.games for line in report.left_out(game)]
-    note = (
-        "Mean evaluation return, and its 95 % t interval over seeds at each env step that all runs of a game "
-        "have. Lines across: policies that learn nothing."
-    )
-    return [tag("p", note, *left_out, class_="note"), tag("div", drawn, class_="grid wide")]
+def figures(folders: Iterable[Path], seen: Collection[Path], looks: Looks) -> list[Shown]:
+    """What experiments.figures has drawn, with its title and question; not what a README has shown."""
+    shown = []
+    for path in itertools.chain(
+        *(sorted(x.glob("figures/*.png"), key=lambda p: natural(p.name)) for x in folders)
+    ):
+        about = beside(path)
+        title, question = (str(about.get(key) or "") for key in ("title", "question"))
+        name = f"Figure {about['figure']}. {title}" if about.get("figure") else title or path.stem
+        drawn = about["styles"] if isinstance(about.get("styles"), dict) else {}
+        if any(looks[arm][0] not in str(drawn[arm]) for arm in drawn.keys() & looks):
+            question += " Its colours are not this page's: it was drawn of other arms."
+        if path.resolve() not in seen:
+            shown.append(Shown(pictures.taken(path, pictures.LARGEST), name, name, question.strip()))
+    return shown
 
 
-def profiles(report: Report) -> Content:
-    """Performance profiles; the baseline and a few arms in each picture, where there are many."""
-    games, thresholds, found = numbers.profiles(report.comparisons, report.arms)
-    if all(np.isnan(interval.low).all() for interval in found.values()):  # a single seed has no distribution
-        return None
-    curves = {arm: pictures.Curve(thresholds, *interval[:3]) for arm, interval in found.items()}
-    seeds = {arm: sum(len(report.comparisons[game].returns[arm]) for game in games) for arm in found}
-    drawn = []
-    for group in groups(list(found), report.baseline):
-        picture = pictures.curves(
-            listed(games),
-            [(report.styles[arm], curves[arm]) for arm in group],
-            size=(5.4, 3.5),
-            label="share of runs above it",
-            across="human-normalised return at the end",
-            limits=(-0.03, 1.03),
-        )
-        caption = _legend(report, {arm: seeds[arm] for arm in group}, "run")
-        drawn.append(figure(picture.source, caption, "Performance profiles", picture.size))
-    kinds = dict.fromkeys(interval.kind for interval in found.values() if interval.kind != statistics.NONE)
-    note = (
-        "The share of an arm's runs that end above a score, averaged over games, and its 95 % interval, "
-        f"{listed(kinds)}. A curve that is higher everywhere is better; where it falls steeply, runs end "
-        "alike. 0 is a random policy, 1 a human; in Catch, a miss and a catch."
-    )
-    return [tag("p", note, class_="note"), tag("div", drawn, class_="grid wide")]
+def learning_curves(
+    game: str, comparison: numbers.Comparison, looks: Looks, baseline: str | None
+) -> dict[str, list[Shown]]:
+    """ "means": all arms, the baseline and a few in each picture; "seeds": each arm with all of its seeds."""
+    none = np.full(len(comparison.steps), np.nan)
+    means, seeds = {}, {}
+    for arm, returns in comparison.returns.items():
+        means[arm] = Curve(comparison.steps, *statistics.curve_interval(returns)[:3])
+        seeds[arm] = [Curve(comparison.steps, one, none, none) for one in returns]
+    policies = {name: row.return_mean for name, row in reference_policies(game).items()}
+    every = [*means.values(), *(curve for curves in seeds.values() for curve in curves)]
+    how = {"policies": policies, "limits": pictures.heights(every, policies.values())}
+    how["across"] = plots.steps_label(game)
+    counts = {arm: len(curves) for arm, curves in seeds.items()}
+    together = _in_groups(game, means, counts, looks, baseline, label="mean return", **how)
+    apart = []
+    for arm, curves in seeds.items():
+        colour, line = looks[arm]
+        lines = [((colour + FAINT, "-"), curve) for curve in curves]
+        lines.append(((colour, line), means[arm]._replace(low=none, high=none)))
+        picture = pictures.curves(arm, lines, size=(3.0, 2.1), **how)
+        apart.append(Shown(picture, f"{game}: {arm}, each seed"))
+    return {"means": together, "seeds": apart}
+
+
+def profiles(
+    comparisons: Mapping[str, numbers.Comparison], looks: Looks, baseline: str | None
+) -> list[Shown]:
+    """Performance profiles; none of a single seed an arm."""
+    games, thresholds, found = numbers.profiles(comparisons)
+    if all(np.isnan(interval.low).all() for interval in found.values()):
+        return []
+    curves = {arm: Curve(thresholds, *interval[:3]) for arm, interval in found.items()}
+    counts = {arm: sum(len(comparisons[game].returns[arm]) for game in games) for arm in found}
+    how = {"label": "share of runs above it", "across": "normalised return at the end"}
+    return _in_groups(", ".join(games), curves, counts, looks, baseline, limits=(-0.03, 1.03), **how)
+
+
+def _in_groups(
+    title: str,
+    curves: Mapping[str, Curve],
+    counts: Mapping[str, int],
+    looks: Looks,
+    baseline: str | None,
+    **how: Any,
+) -> list[Shown]:
+    shown = []
+    for group in groups(list(curves), baseline):
+        picture = pictures.curves(title, [(looks[arm], curves[arm]) for arm in group], size=SIZE, **how)
+        arms = [arm for arm in group for _ in range(counts[arm])]
+        shown.append(Shown(picture, f"{title}: {how['label']}", arms=arms))
+    return shown
 
 
 def groups(arms: Sequence[str], baseline: str | None) -> list[list[str]]:
-    """The arms in groups of at most `pictures.ARMS_A_PICTURE`, the baseline in each."""
-    size = pictures.ARMS_A_PICTURE
-    if len(arms) <= size:
-        return [list(arms)]
-    first = [arm for arm in arms if arm == baseline]
+    """The arms in groups of at most `MANY` and about the same size, the baseline in each."""
     others = [arm for arm in arms if arm != baseline]
-    number = -(-len(others) // (size - 1))
-    size = -(-len(others) // number)
-    return [first + others[i : i + size] for i in range(0, len(others), size)]
+    first = [arm for arm in arms if arm == baseline]
+    count = -(-len(others) // (MANY - len(first))) or 1
+    size = -(-len(others) // count) or 1
+    return [first + others[i : i + size] for i in range(0, max(len(others), 1), size)]
 
 
-def _legend(report: Report, counts: dict[str, int], of: str = "seed") -> Markup:
-    """Which line is whose; arm -> how many seeds, or what `of` says, it has."""
-    words = {"-": "solid", "--": "dashed", ":": "dotted"}
-    items = []
-    for arm, number in counts.items():
-        colour, line = report.styles[arm]
-        mark = tag("span", style=f"border-top-color: {colour}; border-top-style: {words[line]}")
-        items.append(tag("li", mark, f"{arm} ({plural(number, of)})"))
-    return tag("ul", items, class_="legend")
+def differences(game: str, tables: Sequence[Mapping[str, Any]], looks: Looks, baseline: str) -> list[Shown]:
+    """How arms differ from the baseline, from the two `numbers.table` of a game; none without intervals."""
+    names = ("at the end", "averaged over env steps")
+    panels = {
+        name: {arm: row["return_difference"] for arm, row in table.items() if "return_difference" in row}
+        for name, table in zip(names, tables, strict=True)
+    }
+    arms = panels[names[0]]
+    if all(np.isnan(interval.low) for interval in arms.values()):
+        return []
+    picture = pictures.differences(game, baseline, panels, [looks[arm] for arm in arms])
+    return [Shown(picture, f"{game}: differences from {baseline}")]
 
 
-def playing(report: Report) -> Content:
-    """The last evaluation of each arm's first seed."""
-    limit = _limit(report)
+def measured(runs: Sequence[RunData], prefixes: Sequence[str], looks: Looks) -> list[Shown]:
+    """Pictures of the numbers in the rows of a game's runs: a line an arm, with its 95 % t interval.
 
-    def cells(run: RunData) -> list[Markup]:
-        picture = pictures.taken(run.path / "figures" / "play.gif", limit)
-        caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}"]
-        return [figure(picture.source, caption, f"{run_name(run)}, playing")] if picture else []
-
-    return _by_game(report, cells, "play", "The first games of the last evaluation, as the agent sees them.")
-
-
-def panels(report: Report) -> Content:
-    """What the objectives make of observations, of each arm's first seed."""
-    limit = _limit(report)
-
-    def cell(run: RunData, path: Path) -> Markup:
-        picture = pictures.taken(path, limit)
-        caption = [tag("strong", breakable(run.arm)), f", seed {run.seed}: {path.stem}"]
-        return figure(picture.source, caption, f"{run_name(run)}: {path.stem}", picture.size)
-
-    note = (
-        "Observations from replay: what went in, what should come out, what came out, and how far off it is."
-    )
-    return _by_game(report, lambda run: [cell(run, path) for path in _panels(run)], "media", note)
-
-
-def _by_game(report: Report, cells: Callable[[RunData], list[Markup]], kind: str, note: str) -> Content:
-    """A grid a game of what each arm's first seed has to show; None where none has anything."""
-    if not report.media:
-        return tag("p", "Left out (--nomedia).", class_="note")
-    parts: list = []
-    for game in report.games:
-        if shown := [cell for run in _first_runs(report, game) for cell in cells(run)]:
-            parts += [tag("h3", game), tag("div", shown, class_=f"grid {kind}")]
-    return [tag("p", note, class_="note"), parts] if parts else None
-
-
-def _first_runs(report: Report, game: str) -> list[RunData]:
-    """The first seed of each arm that has not failed."""
-    return [runs[0] for arm in report.arms if (runs := _sound(report, game, arm))]
+    Args:
+        runs: of one game.
+        prefixes: of the keys, "loss/", say. Those that measures.csv does not have come last.
+        looks: arm -> its colour and line. With more arms than `MANY`, intervals are left out, and so is what
+            matters less.
+    """
+    many = len(looks) > MANY
+    text = importlib.resources.files(__package__).joinpath("measures.csv").read_text(encoding="utf-8")
+    forms = list(csv.DictReader(text.splitlines()))
+    keys = sorted({key for run in runs for row in run.rows for key in row if key.startswith(tuple(prefixes))})
+    exact = {form["key"] for form in forms}
+    known = {key for key in keys for form in forms if fnmatch.fnmatchcase(key, form["key"])}
+    new = [key for key in keys if key not in known and key != "diag/drift/steps"]
+    forms += [{"key": key, "place": 0, "title": key, "meaning": "", "first": ""} for key in new]
+    shown = []
+    for form in [form for form in forms if form["first"] or not many]:
+        before, _, after = form["key"].partition("*")
+        for key in keys:
+            if key != form["key"] and (key in exact or not fnmatch.fnmatchcase(key, form["key"])):
+                continue
+            members = {
+                arm: [_curve(run, key, int(form["place"])) for run in runs if run.arm == arm] for arm in looks
+            }
+            curves = {arm: pictures.interval_curves(its) for arm, its in members.items()}
+            if lines := [(looks[arm], curve) for arm, curve in curves.items() if curve is not None]:
+                if many:  # bands would hide the lines
+                    lines = [
+                        (x, curve._replace(low=np.nan * curve.low, high=np.nan * curve.high))
+                        for x, curve in lines
+                    ]
+                title = form["title"].replace("{}", key.removeprefix(before).removesuffix(after))
+                picture = pictures.curves(title, lines, across=plots.steps_label(runs[0].game))
+                alt = f"{runs[0].game}: {title}"
+                shown.append(Shown(picture, alt, caption=form["meaning"], first=bool(form["first"])))
+    return shown
 
 
-def _sound(report: Report, game: str, arm: str | None = None) -> list[RunData]:
-    """The runs of a game, or of one arm on it, that have not failed: others would cut all curves."""
-    return [run for run in report.of(game, arm) if not run.failed]
+def _curve(run: RunData, key: str, place: int) -> tuple[np.ndarray, np.ndarray]:
+    points = []
+    for row in run.rows:
+        if row.get(key) not in (None, []):
+            value = row[key][place] if isinstance(row[key], list) else numbers.value_of(run, row, key)
+            points += [(row["env_steps"], value)] if value is not None else []
+    return np.array([p[0] for p in points], np.int64), np.array([p[1] for p in points], np.float64)
 
 
-def _panels(run: RunData) -> list[Path]:
-    found = sorted((run.path / "figures").glob("*.png"), key=lambda path: natural(path.name))
-    return [path for path in found if path.stem not in OWN]
-
-
-def _limit(report: Report) -> int:
-    """Bytes that a picture of a run may have, so that all of them are not too large together."""
-    runs = [run for game in report.games for run in _first_runs(report, game)]
-    count = sum(1 + len(_panels(run)) for run in runs)
-    return min(max(MEDIA_BYTES // max(count, 1), SMALLEST_PICTURE), LARGEST_PICTURE)
-
-
-def diagnostic_pictures(report: Report) -> Content:
-    """A small picture for each number, a line an arm; drift as a picture of the first seed."""
-    without = diagnostics.missing(report.runs)
-    evaluated = [run for run in report.runs if len(collect.steps_and_returns(run)[0])]
-    if not any(diagnostics.keys_of([run]) for run in report.runs):
-        return (
-            tag("p", "These runs have no diagnostics: they are of before there were any.")
-            if evaluated
-            else None
-        )
-    parts: list = []
-    for game in report.games:
-        found = diagnostics.panels(_sound(report, game), report.styles)
-        if not found:
-            continue
-        first, others = (
-            [_panel(game, panel) for panel in found if panel.first == at_once] for at_once in (True, False)
-        )
-        having = {run.arm for run in _sound(report, game) if diagnostics.keys_of([run])}
-        seeds = {arm: len(_sound(report, game, arm)) for arm in report.arms if arm in having}
-        parts += [tag("h3", game), _legend(report, seeds), tag("div", first, class_="grid small")]
-        if others:
-            more = f"{plural(len(others), 'more picture')} of {game}"
-            parts.append(details(more, tag("div", others, class_="grid small")))
-        parts.append(_drift(report, game))
-    if without:
-        parts.append(tag("p", f"Without diagnostics: {listed(map(run_name, without))}.", class_="note"))
-    note = (
-        "Measured at every evaluation; means over seeds that have not failed and their 95 % t intervals at "
-        "each point."
-    )
-    return [tag("p", note, class_="note"), *parts]
-
-
-def _panel(game: str, panel: diagnostics.Panel) -> Markup:
-    return figure(panel.picture.source, panel.meaning, f"{game}: {panel.title}", panel.picture.size)
-
-
-def _drift(report: Report, game: str) -> Content:
-    """The error of each epoch's decoder on each epoch's encoder, of each arm's first seed."""
-    found = []
-    for run in _first_runs(report, game):
-        picture = pictures.drawn(functools.partial(diagnostic_plots.drift_matrix, run.rows, title=""))
+def drift(runs: Iterable[RunData]) -> list[Shown]:
+    """The error of each epoch's decoder on each epoch's encoder, a picture a run."""
+    shown = []
+    for run in runs:
+        picture = pictures.drawn(functools.partial(run_figures.drift_matrix, run.rows, title=""))
         if picture is not None:
-            caption = [
-                tag("strong", breakable(run.arm)),
-                f", seed {run.seed}: each epoch's decoder on each epoch's encoder",
-            ]
-            found.append(figure(picture.source, caption, f"{run_name(run)}: drift", picture.size))
-    return tag("div", found, class_="grid media") if found else None
+            caption = f"seed {run.seed}: each epoch's decoder on each epoch's encoder"
+            shown.append(Shown(picture, f"{run.game} / {run.arm}: drift", run.arm, caption))
+    return shown
+
+
+def own_pictures(games: Iterable[numbers.Game]) -> dict[str, dict[str, list[Shown]]]:
+    """Game -> "gif" and "png" -> what lies with the first seed of each arm, and a report cannot draw.
+
+    These are games that were played, and inputs and outputs of objectives. They are made smaller where all of
+    them would be too much for a page.
+    """
+    found = [
+        (run, path)
+        for game in games
+        for run in game.first
+        for path in sorted((run.path / "figures").glob("*.*"))
+        if path.suffix in (".gif", ".png") and path.stem not in OWN
+    ]
+    limit = min(max(MEDIA_BYTES // max(len(found), 1), SMALLEST_PICTURE), LARGEST_PICTURE)
+    shown: dict[str, dict[str, list[Shown]]] = {}
+    for run, path in found:
+        name, kinds = f"seed {run.seed}: {path.stem}", shown.setdefault(run.game, {"gif": [], "png": []})
+        picture = pictures.taken(path, limit)
+        kinds[path.suffix[1:]].append(Shown(picture, f"{run.game} / {run.arm} / {name}", run.arm, name))
+    return shown

@@ -1,26 +1,22 @@
-"""What a report says in numbers: which runs there are, how they compare, what they cost.
+"""What a report says in numbers: which runs there are, how they compare, what they cost. Imports no jax."""
 
-Imports no jax.
-"""
-
-import os
+import csv
+import io
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from srl_jax import statistics
-from srl_jax.config import Config
 from srl_jax.data import with_reference_scores
 from srl_jax.errors import ConfigError
 from srl_jax.specs import LIMITS
+from srl_jax.statistics import NARROW, Interval
 
 from .. import collect
 from ..collect import RunData, has_policy
-from ..directories import natural
 from ..presets import PRESETS
-from . import configs
+from ..run_data import natural
 
 NEVER = 1e18
 """Env steps that stand for never, where a median is drawn again."""
@@ -42,47 +38,43 @@ class Comparison(NamedTuple):
     cut_by: RunData | None
 
 
-class Row(NamedTuple):
-    """An arm on a game, compared with the others at the last env step that all runs have.
+class Game(NamedTuple):
+    """The runs of one game.
 
     Attributes:
-        final: mean over seeds of the return there.
-        area: of the return averaged over the env steps until then.
-        final_difference, area_difference: from the baseline's; None for the baseline itself.
-        reaching: env steps until the score is reached; its median over seeds, NEVER or more for never.
-        reached: how many runs did.
+        name: of the game.
+        runs: arm -> its runs, arms in the order of the page.
+        comparable: whether there are runs to compare.
+        comparison: of them; None also where they have no env step in common.
     """
 
-    game: str
-    arm: str
-    seeds: int
-    final: statistics.Interval
-    area: statistics.Interval
-    final_difference: statistics.Interval | None
-    area_difference: statistics.Interval | None
-    reaching: statistics.Interval
-    reached: int
+    name: str
+    runs: dict[str, list[RunData]]
+    comparable: bool
+    comparison: Comparison | None
 
+    @property
+    def sound(self) -> list[RunData]:
+        """Those that have not failed: others would cut all curves."""
+        return [run for runs in self.runs.values() for run in runs if not run.failed]
 
-class Cost(NamedTuple):
-    """What an arm's runs on a game took.
+    @property
+    def first(self) -> list[RunData]:
+        """Each arm's first seed of these."""
+        return list({run.arm: run for run in reversed(self.sound)}.values())[::-1]
 
-    Attributes:
-        hours: of all runs together, by their own clocks.
-        per_run: hours of one, the mean.
-        speed: env steps a second, the median over rows of training.
-        relative: time for an env step, as a multiple of the baseline's; None without one.
-        source: the arm that its encoder was made by, or empty.
-    """
+    @property
+    def played(self) -> list[RunData]:
+        """Those with a policy."""
+        return [run for runs in self.runs.values() for run in runs if has_policy(run)]
 
-    game: str
-    arm: str
-    runs: int
-    hours: float
-    per_run: float
-    speed: float | None
-    relative: float | None
-    source: str
+    @property
+    def left_out(self) -> list[str]:
+        """A line for each arm of which seeds are not compared."""
+        whys: dict[str, dict[int, str]] = {arm: {} for arm in self.runs}
+        for run, why in collect.left_out([run for runs in self.runs.values() for run in runs]):
+            whys[run.arm][run.seed] = why
+        return [collect.left_out_text(arm, why, len(self.runs[arm])) for arm, why in whys.items() if why]
 
 
 def arms_of(runs: Sequence[RunData]) -> list[str]:
@@ -104,20 +96,13 @@ def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None 
         ConfigError: the one that was asked for is not there.
     """
     playing = {run.arm for run in runs if has_policy(run)}
-    if given is not None:
-        if given not in playing:
-            raise ConfigError(
-                f"--baseline={given}: not an arm with a policy; valid: {', '.join(sorted(playing))}"
-            )
-        return given
+    if given is not None and given not in playing:
+        raise ConfigError(
+            f"--baseline={given}: not an arm with a policy; valid: {', '.join(sorted(playing))}"
+        )
     playing = {run.arm for run in collect.comparable(runs)} or playing
     plain = {run.arm for run in runs if run.config.mode == "rl_only"} & playing
-    return next((arm for arm in arms if arm in (plain or playing)), None)
-
-
-def config_of(runs: Sequence[RunData]) -> Config:
-    """Of the first run with a policy: the protocol of a game."""
-    return next(run.config for run in runs if has_policy(run))
+    return given or next((arm for arm in arms if arm in (plain or playing)), None)
 
 
 def reached_step(run: RunData) -> int:
@@ -136,77 +121,92 @@ def finished(run: RunData) -> bool:
     steps, returns = collect.steps_and_returns(run)
     if config.stop_at_return is not None and (returns >= config.stop_at_return).any():
         return True
-    evaluated = not has_policy(run) or (
-        len(steps) > 0 and steps[-1] >= _last(config.steps, config.eval_every)
-    )
-    return evaluated and reached_step(run) >= _last(config.steps, min(config.log_every, config.steps))
+    evaluated = len(steps) and steps[-1] >= config.steps // config.eval_every * config.eval_every
+    every = min(config.log_every, config.steps)
+    return (evaluated or not has_policy(run)) and reached_step(run) >= config.steps // every * every
 
 
-def _last(steps: int, every: int) -> int:
-    return steps // every * every
-
-
-def compare(runs: Sequence[RunData], arms: Sequence[str]) -> dict[str, Comparison | None]:
-    """Game -> its `comparable` learning curves at equal steps; None where there is no step that all have.
+def compare(runs: Sequence[RunData]) -> Comparison | None:
+    """The learning curves of one game's runs at equal steps; None where there is no step that all have.
 
     Raises:
         ConfigError: the evaluations of a run are not in ascending order.
     """
-    found: dict[str, Comparison | None] = {}
-    for game, by_arm in collect.grouped(runs).items():
-        members = collect.comparable([run for arm in arms for run in by_arm.get(arm, [])])
-        if not members:
-            continue
-        curves = [collect.steps_and_returns(run) for run in members]
-        for run, (steps, _) in zip(members, curves, strict=True):
-            if (np.diff(steps) <= 0).any():
-                raise ConfigError(f"{run.path}: evaluations in metrics.jsonl are not in ascending order")
-        try:
-            steps, returns = statistics.at_equal_steps(curves)
-        except ValueError:
-            found[game] = None
-            continue
-        ends = [int(curve[0][-1]) for curve in curves]
-        first = members[int(np.argmin(ends))] if min(ends) < max(ends) else None
-        by_arm = {arm: returns[[run.arm == arm for run in members]] for arm in arms}
-        found[game] = Comparison(steps, {arm: x for arm, x in by_arm.items() if len(x)}, first)
-    return found
+    curves = [collect.steps_and_returns(run) for run in runs]
+    for run, (steps, _) in zip(runs, curves, strict=True):
+        if (np.diff(steps) <= 0).any():
+            raise ConfigError(f"{run.path}: evaluations in metrics.jsonl are not in ascending order")
+    try:
+        steps, returns = statistics.at_equal_steps(curves)
+    except ValueError:
+        return None
+    ends = [int(curve[0][-1]) for curve in curves]
+    first = runs[int(np.argmin(ends))] if min(ends) < max(ends) else None
+    arms = dict.fromkeys(run.arm for run in runs)
+    return Comparison(steps, {arm: returns[[run.arm == arm for run in runs]] for arm in arms}, first)
 
 
-def scores(comparisons: Mapping[str, Comparison | None], of: str, arms: Sequence[str]) -> dict[str, dict]:
-    """arm -> game -> float64 [runs]: the last return, or the one averaged over env steps.
-
-    Args:
-        comparisons: from `compare`.
-        of: "final" or "area".
-        arms: in their order.
-    """
+def scores(comparisons: Mapping[str, Comparison], of: str) -> dict[str, dict[str, np.ndarray]]:
+    """arm -> game -> float64 [runs]: the last return, "final", or the one averaged over env steps, "area"."""
     found: dict[str, dict[str, np.ndarray]] = {}
-    for arm in arms:
-        for game, comparison in comparisons.items():
-            if comparison is not None and arm in comparison.returns:
-                curves = comparison.returns[arm]
-                area = statistics.area_under_curve(comparison.steps, curves)
-                found.setdefault(arm, {})[game] = area if of == "area" else curves[:, -1]
+    for game, comparison in comparisons.items():
+        for arm, curves in comparison.returns.items():
+            area = statistics.area_under_curve(comparison.steps, curves)
+            found.setdefault(arm, {})[game] = area if of == "area" else curves[:, -1]
     return found
 
 
-def profiles(
-    comparisons: Mapping[str, Comparison | None], arms: Sequence[str]
-) -> tuple[list[str], np.ndarray, dict[str, statistics.Interval]]:
-    """The share of an arm's runs that end above a human-normalised return, averaged over games.
+def table(
+    comparisons: Mapping[str, Comparison], of: str, baseline: str | None
+) -> dict[str | None, dict[str, dict[str, Interval]]]:
+    """game -> arm -> statistic -> its Interval; the game None is for all that every arm has, normalised.
 
     Args:
         comparisons: from `compare`.
-        arms: in their order.
+        of: see `scores`.
+        baseline: what `srl_jax.statistics.summary`, which names the statistics, compares with.
+    """
+    given = scores(comparisons, of)
+    found: dict[str | None, dict[str, dict[str, Interval]]] = {}
+    for row in statistics.summary(given, baseline=baseline if baseline in given else None):
+        limits = (np.float64(np.nan if row[name] is None else row[name]) for name in Interval._fields[:3])
+        own = found.setdefault(row["game"], {}).setdefault(row["arm"], {})
+        own[row["statistic"]] = Interval(*limits, row["kind"])
+    return found
+
+
+def verdict(difference: Interval) -> str:
+    """What an interval of a difference says; nothing is concluded from one that is too narrow."""
+    if np.isnan(difference.low):
+        return "no interval"
+    if difference.kind == NARROW:
+        return "too few seeds"
+    return "better" if difference.low > 0 else "worse" if difference.high < 0 else "not told apart"
+
+
+def reaching(comparison: Comparison, target: float) -> dict[str, tuple[Interval, int]]:
+    """arm -> env steps until a score is reached, the median over seeds, and how many seeds reached it.
+
+    NEVER or more is never.
+    """
+    found = {}
+    for arm, curves in comparison.returns.items():
+        taken = statistics.steps_to(comparison.steps, curves, target)
+        times = {"": np.where(np.isnan(taken), NEVER, taken)}
+        median = statistics.estimate(lambda drawn: np.median(drawn[""], axis=-1), times)
+        found[arm] = median, int(np.isfinite(taken).sum())
+    return found
+
+
+def profiles(comparisons: Mapping[str, Comparison]) -> tuple[list[str], np.ndarray, dict[str, Interval]]:
+    """The share of an arm's runs that end above a normalised return, averaged over games.
 
     Returns:
         The games that every arm with a policy has and that have reference scores; thresholds [T], from just
-        below the smallest score to the largest; arm -> its profile [T]. No arm where there is no such game.
+        below the smallest score to the largest; arm -> its profile [T], no arm where there is no such game.
     """
-    given = scores(comparisons, "final", arms)
-    games = [game for game in comparisons if given and all(game in mine for mine in given.values())]
-    games = with_reference_scores(games)
+    given = scores(comparisons, "final")
+    games = with_reference_scores(game for game in comparisons if all(game in x for x in given.values()))
     if not games:
         return [], np.zeros(0), {}
     normal = {
@@ -214,8 +214,7 @@ def profiles(
         for arm, mine in given.items()
     }
     every = np.concatenate([x for mine in normal.values() for x in mine.values()])
-    room = 0.02 * (np.ptp(every) or 1.0)
-    thresholds = np.linspace(every.min() - room, every.max(), THRESHOLDS)
+    thresholds = np.linspace(every.min() - 0.02 * (np.ptp(every) or 1.0), every.max(), THRESHOLDS)
 
     def profile(drawn: Mapping[str, np.ndarray]) -> np.ndarray:
         return statistics.performance_profile(drawn, thresholds)
@@ -223,92 +222,16 @@ def profiles(
     return games, thresholds, {arm: statistics.estimate(profile, mine) for arm, mine in normal.items()}
 
 
-def targets(
-    comparisons: Mapping[str, Comparison | None], baseline: str | None, given: Mapping[str, float]
-) -> dict[str, float]:
-    """game -> the score to be reached: the one given, else what the baseline ends with on average."""
-    return {
-        game: given.get(game, float(np.mean(comparison.returns[baseline][:, -1])))
-        for game, comparison in comparisons.items()
-        if comparison is not None and (game in given or baseline in comparison.returns)
-    }
+def hours(runs: Sequence[RunData]) -> float:
+    """What runs took so far, all together, by their own clocks."""
+    return sum(value_of(run, run.rows[-1], "wall_s") or 0.0 for run in runs if run.rows) / 3600
 
 
-def rows(
-    comparisons: Mapping[str, Comparison | None],
-    arms: Sequence[str],
-    baseline: str | None,
-    wanted: Mapping[str, float],
-) -> list[Row]:
-    """The table of each game, arms in their order."""
-    final, area = (scores(comparisons, of, arms) for of in ("final", "area"))
-    found = []
-    for game, comparison in comparisons.items():
-        for arm in arms:
-            if comparison is None or arm not in comparison.returns:
-                continue
-            mine = [{game: x[arm][game]} for x in (final, area)]
-            differences = [None, None]
-            if arm != baseline and game in final.get(baseline, {}):
-                theirs = [{game: x[baseline][game]} for x in (final, area)]
-                differences = [
-                    statistics.estimate_difference(x, y) for x, y in zip(mine, theirs, strict=True)
-                ]
-            values = [statistics.estimate(statistics.mean, x) for x in mine]
-            taken = np.full(len(comparison.returns[arm]), np.nan)
-            if game in wanted:
-                taken = statistics.steps_to(comparison.steps, comparison.returns[arm], wanted[game])
-            never = np.isnan(taken)
-            reaching = statistics.estimate(_median_run, {game: np.where(never, NEVER, taken)})
-            found.append(Row(game, arm, len(taken), *values, *differences, reaching, int((~never).sum())))
-    return found
-
-
-def _median_run(given: Mapping[str, np.ndarray]) -> np.ndarray:
-    (values,) = given.values()
-    return np.median(values, axis=-1)
-
-
-def costs(runs: Sequence[RunData], arms: Sequence[str], baseline: str | None) -> list[Cost]:
-    """The cost of each arm on each game.
-
-    Raises:
-        ConfigError: a row's clock is no number.
-    """
-    found = []
-    for game, by_arm in collect.grouped(runs).items():
-        speeds = {arm: _speed(members) for arm, members in by_arm.items()}
-        reference = speeds.get(baseline)
-        for arm in arms:
-            if arm not in by_arm:
-                continue
-            members = [run for run in by_arm[arm] if run.rows]
-            hours = [(value_of(run, run.rows[-1], "wall_s") or 0.0) / 3600 for run in members]
-            total, mean = sum(hours), sum(hours) / len(hours) if hours else 0.0
-            relative = reference / speeds[arm] if reference and speeds[arm] else None
-            origin = next(filter(None, (_source(run, runs) for run in by_arm[arm])), "")
-            found.append(Cost(game, arm, len(members), total, mean, speeds[arm], relative, origin))
-    return found
-
-
-def _speed(runs: Sequence[RunData]) -> float | None:
+def speed(runs: Sequence[RunData]) -> float | None:
+    """Env steps a second, the median over rows of training."""
     rows = [(run, row) for run in runs for row in run.rows if row["kind"] == "train"]
-    values = [value_of(run, row, "wall_steps_per_s") for run, row in rows]
-    values = [value for value in values if value]
+    values = [value for run, row in rows if (value := value_of(run, row, "wall_steps_per_s"))]
     return float(np.median(values)) if values else None
-
-
-def _source(run: RunData, runs: Sequence[RunData]) -> str:
-    """The arm of the run that its encoder is from; the path's own words where that run is not among these."""
-    if not (path := run.config.encoder_from):
-        return ""
-    parts = Path(path).parts
-    for other in runs:
-        # As it is named here, and as it lies on disk: its directory may be a link.
-        tails = {p.parts[-3:] for p in (other.path.absolute(), Path(os.path.realpath(other.path)))}
-        if any(parts[i : i + 3] in tails for i in range(len(parts))):
-            return other.arm
-    return configs.source_name(path)
 
 
 def value_of(run: RunData, row: Mapping[str, Any], key: str) -> float | None:
@@ -318,19 +241,27 @@ def value_of(run: RunData, row: Mapping[str, Any], key: str) -> float | None:
         ConfigError: it is something else.
     """
     value = row.get(key)
-    if value is None:
-        return None
-    if type(value) not in (int, float) or abs(value) > LIMITS[float]:
+    if value is not None and (type(value) not in (int, float) or abs(value) > LIMITS[float]):
         raise ConfigError(f"{run.path / 'metrics.jsonl'}: {key} is not a number of single precision")
-    return float(value)
+    return None if value is None else float(value)
 
 
-def numbers_of(run: RunData, row: Mapping[str, Any], key: str) -> list[float | None]:
-    """A list of numbers of a row, or one number as a list of it; null is None.
+def as_csv(runs: Sequence[RunData]) -> str:
+    """Every row of all runs: game, arm, seed, kind ("train" or "eval"), env_step, and a column a number.
 
-    Raises:
-        ConfigError: it is something else.
+    Lists (the returns of single games, drift) are left out. What a row does not have is empty.
     """
-    value = row.get(key)
-    items = value if isinstance(value, list) else [value]
-    return [value_of(run, {key: item}, key) for item in items]
+    rows = []
+    for run in runs:
+        for row in run.rows:
+            values = {key: value for key, value in row.items() if isinstance(value, int | float)}
+            own = {"game": run.game, "arm": run.arm, "seed": run.seed, "kind": row["kind"]}
+            rows.append({**own, "env_step": values.pop("env_steps"), **values})
+    first = ["game", "arm", "seed", "kind", "env_step"]
+    file = io.StringIO()
+    writer = csv.DictWriter(
+        file, [*first, *sorted({x for row in rows for x in row} - {*first})], lineterminator="\n"
+    )
+    writer.writeheader()
+    writer.writerows(rows)
+    return file.getvalue()

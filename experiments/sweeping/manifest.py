@@ -1,17 +1,20 @@
-"""sweep.json: the runs of a sweep, as they were planned. Plain JSON; imports no jax."""
+"""sweep.json: the runs of a sweep as they were planned, each with the configuration that it has."""
 
 import dataclasses
 import json
-import os
-from collections.abc import Mapping
+import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from srl_jax.config import Config
-from srl_jax.errors import ConfigError, SaveError
-from srl_jax.reading import parse_json, read_bytes
+from absl import flags
 
-from .plan import Planned
+from srl_jax.config import Config, difference
+from srl_jax.errors import ConfigError, saving
+from srl_jax.reading import parse_json, read_bytes, replace_text
+
+from .. import flags as config_flags
+from .plan import Planned, settings
 
 FILE = "sweep.json"
 FORMAT = 1
@@ -26,7 +29,7 @@ class Entry(NamedTuple):
 
 
 def read(root: Path) -> dict[str, Entry]:
-    """{name: Entry} of the sweep in a directory, sources first; {} where there is none.
+    """{name: Entry} of the sweep in a directory, in the order of the plan; {} where there is none.
 
     Raises:
         ConfigError: it cannot be read.
@@ -35,43 +38,27 @@ def read(root: Path) -> dict[str, Entry]:
     try:
         content = parse_json(read_bytes(path, _LIMIT))
         if content["format"] != FORMAT:
-            raise ConfigError(f"{path}: of format {content['format']}, not {FORMAT}")
-        entries = {}
-        for about in content["runs"]:
-            run = planned({name: about[name] for name in about if name != "config"})
-            entries[run.name] = Entry(run, Config.from_json(json.dumps(about["config"])))
+            raise ValueError(f"of format {content['format']}, not {FORMAT}")
+        entries = {about["name"]: _entry(**about) for about in content["runs"]}
+        for run, _ in entries.values():
+            if missing := set(run.sources) - entries.keys():
+                raise ValueError(f"{run.name} starts from {missing.pop()}, which is not there")
         return entries
     except FileNotFoundError:
         return {}
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
-    except ConfigError as error:
-        raise ConfigError(f"{path}: {error}") from None
     except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(
-            f"{path}: not a sweep's manifest ({type(error).__name__}: {error!s:.100})"
-        ) from None
+        raise ConfigError(f"{path}: not what a sweep writes: {error!s:.200}") from None
 
 
-def planned(values: Mapping[str, Any]) -> Planned:
-    """A run from JSON values.
-
-    Raises:
-        ConfigError: its name is not one of a directory below the sweep's.
-        TypeError, AttributeError: they are not a run's.
-    """
-    run = Planned(**values)
+def _entry(config: Mapping[str, Any], **about: Any) -> Entry:
+    run = Planned(**about)
+    parts = run.name.split("/")
+    if len(parts) != 3 or not all(part.strip(".") for part in parts):
+        raise ValueError(f"{run.name}: not the name of a run, GAME/ARM/seedN")
     flags = {name: tuple(x) if isinstance(x, list) else x for name, x in run.flags.items()}
-    texts = [run.name, run.preset, run.encoder_from, run.policy_from, *flags]
-    for x in flags.values():
-        texts += x if isinstance(x, tuple) else (x,)
-    if not all(type(text) is str for text in texts):
-        raise TypeError("a run is made of texts")
-    for name in (run.name, *run.sources):
-        parts = name.split("/")
-        if len(parts) != 3 or not all(part.isprintable() and part.strip(".") for part in parts):
-            raise ConfigError(f"{name}: not the name of a run, GAME/ARM/seedN")
-    return run._replace(flags=flags)
+    return Entry(run._replace(flags=flags), Config.from_json(json.dumps(config)))
 
 
 def write(root: Path, entries: Mapping[str, Entry]) -> None:
@@ -81,22 +68,73 @@ def write(root: Path, entries: Mapping[str, Entry]) -> None:
         SaveError: it could not be written.
     """
     runs = [{**run._asdict(), "config": dataclasses.asdict(config)} for run, config in entries.values()]
-    replace(root / FILE, json.dumps({"format": FORMAT, "runs": runs}, indent=1) + "\n")
+    with saving(root / FILE):
+        replace_text(root / FILE, json.dumps({"format": FORMAT, "runs": runs}, indent=1) + "\n")
 
 
-def replace(path: Path, text: str) -> None:
-    """Writes a file at once, flushed to disk, or leaves the one that is there.
+def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
+    """{name: the run with the configuration that it will write into its config.json}; imports jax.
 
     Raises:
-        SaveError: it could not be written.
+        ConfigError: a run's flags are not valid, or it cannot start from the runs that it names.
     """
-    partial = path.with_name(path.name + ".partial")
+    if "jax" not in sys.modules:  # this process shall take no GPU, and those of the runs may
+        import jax
+
+        jax.config.update("jax_platforms", "cpu")
+    from srl_jax.training import resolved
+
+    from ..train import check_extras
+
+    entries: dict[str, Entry] = {}
+    known: dict[Config, Config] = {}  # what differs by the seed alone is resolved once
+    for run in runs:
+        try:
+            config = parsed(run)
+            key = dataclasses.replace(config, seed=0)
+            if key not in known:
+                check_extras(config)
+                known[key] = resolved(key)
+            entries[run.name] = Entry(run, dataclasses.replace(known[key], seed=config.seed))
+        except ConfigError as error:
+            raise ConfigError(f"{run.name}: {error}") from None
+    for entry in entries.values():
+        _check_sources(entry, entries)
+    return entries
+
+
+def parsed(run: Planned) -> Config:
+    """The configuration of a run's command line, not yet resolved.
+
+    Raises:
+        ConfigError: a flag is unknown or its value is not valid.
+    """
+    values = flags.FlagValues()
+    config_flags.define_config_flags(values)
+    config_flags.define_runtime_flag(values)
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with open(partial, "w", encoding="utf-8") as file:
-            file.write(text)
-            file.flush()
-            os.fsync(file.fileno())
-        os.replace(partial, path)
-    except OSError as error:
-        raise SaveError(f"{path}: not written: {error.strerror}") from error
+        values([run.name, *settings(run)])
+    except flags.UnrecognizedFlagError as error:
+        raise ConfigError(f"--{error.flagname}: {config_flags.unknown(error.flagname, values)}") from None
+    except (flags.Error, ValueError) as error:
+        raise ConfigError(str(error).removeprefix("flag ")) from None
+    return config_flags.config_from_flags(values)
+
+
+def _check_sources(entry: Entry, entries: Mapping[str, Entry]) -> None:
+    """`srl_jax.checkpoint.check_sources` before there are any checkpoints.
+
+    Raises:
+        ConfigError: the run cannot start from those that it names.
+    """
+    (run, here), frames = entry, ("frame_size", "frame_stack")
+    for source, names in ((run.encoder_from, ("encoder", *frames)), (run.policy_from, ("game", *frames))):
+        if not source:
+            continue
+        if source not in entries:
+            raise ConfigError(f"{run.name}: starts from {source}, which is not a run of this sweep")
+        there = entries[source].config
+        if differing := difference(there, here, names):
+            raise ConfigError(f"{run.name}: cannot start from {source}: {differing}")
+        if source == run.policy_from and there.mode == "pretrain":
+            raise ConfigError(f"{run.name}: {source} has no policy: its mode is pretrain")

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from srl_jax import envs, plugins
+from srl_jax import envs, loggers, plugins
 from srl_jax.config import INFOS
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text
@@ -130,11 +130,13 @@ def plan(
     Raises:
         ConfigError: a name is unknown, or two runs would have the same one.
     """
-    flags = _checked("", flags or {})
+    flags = _checked(flags or {})
     by_name: dict[str, Arm] = {}
     for arm in arms:
-        _check(arm)
-        arm = arm._replace(flags=_checked(f"arm {arm.name}: ", arm.flags))
+        try:
+            arm = _checked_arm(arm)
+        except ConfigError as error:
+            raise ConfigError(f"arm {arm.name}: {error}") from None
         if by_name.setdefault(arm.name, arm) != arm:
             raise ConfigError(
                 f"arm {arm.name}: there twice, of {by_name[arm.name].preset} and of {arm.preset}; "
@@ -178,27 +180,27 @@ def plan(
     return list(runs.values())
 
 
-def _check(arm: Arm) -> None:
-    try:
-        parts(arm.preset)
-    except ConfigError as error:
-        raise ConfigError(f"arm {arm.name}: {error}") from None
-    plain = arm.name.replace("_", "").replace("-", "").replace(".", "").replace("=", "")
-    if not (plain.isascii() and plain.isalnum()) or arm.name.startswith("."):
-        raise ConfigError(f"arm {arm.name}: a name is made of letters, digits and _ - . =")
-    if ".broken-" in arm.name:
-        raise ConfigError(f"arm {arm.name}: .broken- marks what was moved aside; give it another name")
+def _checked_arm(arm: Arm) -> Arm:
+    parts(arm.preset)
+    if not re.fullmatch(r"(?!\.)[A-Za-z0-9_.=-]*[A-Za-z0-9][A-Za-z0-9_.=-]*", arm.name):
+        raise ConfigError("a name is made of letters, digits and _ - . =")
+    if ".broken-" in arm.name:  # `run_data.run_directories` passes over it
+        raise ConfigError(".broken- marks what an earlier version moved aside; give it another name")
+    return arm._replace(flags=_checked(arm.flags))
 
 
-def _checked(where: str, flags: Flags) -> dict[str, str | tuple[str, ...]]:
+def _checked(flags: Flags) -> dict[str, str | tuple[str, ...]]:
     """The flags, with the files that they import named so that a process finds them that works elsewhere."""
     for flag, mine in OWN.items():
         if flag in flags:
-            raise ConfigError(f"{where}--{flag}: a sweep gives it to each run; --{mine} decides it")
+            raise ConfigError(f"--{flag}: a sweep gives it to each run; --{mine} decides it")
     own = dict(flags)
     if "import" in own:
         texts = (own["import"],) if isinstance(own["import"], str) else own["import"]
         own["import"] = tuple(text if text == "none" else plugins.located(text) for text in texts)
+    if "logger" in own:
+        texts = (own["logger"],) if isinstance(own["logger"], str) else own["logger"]
+        own["logger"] = loggers.listed(texts) or ("none",)
     return own
 
 
@@ -245,13 +247,14 @@ def parse_seeds(text: str, flag: str = "seeds") -> list[int]:
     return list(range(numbers[0])) if len(parts) == 1 else numbers
 
 
-def settings(run: Planned) -> list[str]:
-    """The flags of a run's settings, but for the runs that it starts from."""
+def settings(run: Planned, root: str | os.PathLike = "") -> list[str]:
+    """The flags of a run's settings; what it starts from lies under the sweep's root."""
     found = [f"--preset={run.preset}"]
     for name, value in run.flags.items():
         values = value if isinstance(value, tuple) else (value,)
         found += [f"--{name}={text}" for text in values or ("none",)]
-    return found
+    sources = {"encoder_from": run.encoder_from, "policy_from": run.policy_from}
+    return found + [f"--{flag}={os.path.join(root, name)}" for flag, name in sources.items() if name]
 
 
 def command(run: Planned, root: str | os.PathLike = "") -> list[str]:
@@ -259,11 +262,8 @@ def command(run: Planned, root: str | os.PathLike = "") -> list[str]:
 
     Args:
         run: of a sweep.
-        root: the sweep's; empty for a process that works there. Launchers do that: config.json then names
-            what a run starts from as it lies under the root, wherever that is.
+        root: the sweep's; empty for a process that works there. A sweep's processes do: config.json then
+            names what a run starts from as it lies under the root, wherever that is.
     """
-    found = [sys.executable, "-m", f"{PACKAGE}.train", *settings(run)]
-    for flag in SOURCES:
-        if source := getattr(run, flag):
-            found.append(f"--{flag}={os.path.join(root, source)}")
-    return [*found, f"--out={os.path.join(root, run.name)}", "--resume=auto"]
+    train = [sys.executable, "-m", f"{PACKAGE}.train"]
+    return [*train, *settings(run, root), f"--out={os.path.join(root, run.name)}", "--resume=auto"]

@@ -4,13 +4,13 @@ import csv
 import functools
 import importlib.resources
 import io
+import typing
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple, TypeVar
 
 import numpy as np
 
 from srl_jax import envs
-from srl_jax.config import Config
 
 
 class Published(NamedTuple):
@@ -41,38 +41,6 @@ class Published(NamedTuple):
     epsilon: float | None
     protocol: str
     source: str
-
-    def differs_from(self, config: Config, env_steps: int | None = None, seeds: int | None = None) -> str:
-        """One line on what differs from the evaluations of a run, to be shown wherever both are.
-
-        Args:
-            config: of the run.
-            env_steps: when it was evaluated; by default at its end.
-            seeds: runs that its score is the mean of; None leaves them out.
-
-        Returns:
-            "env steps 250,000 (here 100,000), training score (here the mean of 10 evaluation games); not
-            known: sticky actions, seeds", say; "" if nothing differs.
-        """
-        compared: dict[str, tuple[float | None, float | None]]
-        compared = {"sticky actions": (self.sticky_actions, config.sticky_actions)}
-        if self.env_steps is not None:
-            compared |= {
-                "env steps": (self.env_steps, config.steps if env_steps is None else env_steps),
-                "epsilon": (self.epsilon, config.eps_eval),
-                "seeds": (self.seeds, self.seeds if seeds is None else seeds),
-            }
-        texts = [
-            f"{name} {there:,} (here {here:,})"
-            for name, (there, here) in compared.items()
-            if there not in (None, here)
-        ]
-        if self.score_of not in (None, "evaluation"):
-            texts.append(f"{self.score_of} score (here the mean of {config.eval_games} evaluation games)")
-        unknown = [name for name, (there, _) in compared.items() if there is None]
-        unknown += ["kind of score"] if self.score_of is None else []
-        parts = [", ".join(texts), f"not known: {', '.join(unknown)}" if unknown else ""]
-        return "; ".join(part for part in parts if part)
 
 
 POLICIES = ("random", "no-op")
@@ -105,17 +73,6 @@ class ReferencePolicy(NamedTuple):
     noop_max: int | None
     eval_max_steps: int | None
     source: str
-
-    def differs_from(self, config: Config) -> str:
-        """One line on what differs from a run's evaluations, to be shown beside both; "" if nothing does."""
-        if self.episodes is None:
-            return f"published, {self.source}; not known: sticky actions"
-        there = {name: getattr(self, name) for name in ("sticky_actions", "noop_max", "eval_max_steps")}
-        return ", ".join(
-            f"{name.replace('_', ' ')} {value:,} (here {getattr(config, name):,})"
-            for name, value in there.items()
-            if value not in (None, getattr(config, name))
-        )
 
 
 def reference_policies(game: str) -> dict[str, ReferencePolicy]:
@@ -219,24 +176,16 @@ _Record = TypeVar("_Record", Published, ReferencePolicy)
 
 
 def _record(kind: type[_Record], row: Mapping[str, str]) -> _Record:
-    """A row of a table as a named tuple; an empty field is None."""
-    return kind._make(_KINDS.get(name, str)(row[name]) if row.get(name) else None for name in kind._fields)
+    """A row of a table as a named tuple, each field of the type that it is declared with; empty is None."""
+    hints = typing.get_type_hints(kind)
+    values = []
+    for name in kind._fields:
+        types = typing.get_args(hints[name]) or (hints[name],)
+        read = int if int in types else float if float in types else str
+        values.append(read(row[name]) if row.get(name) else None)
+    return kind._make(values)
 
 
-_KINDS: dict[str, type[int | float]] = {
-    "env_steps": int,
-    "score": float,
-    "spread": float,
-    "seeds": int,
-    "sticky_actions": float,
-    "epsilon": float,
-    "return_mean": float,
-    "return_std": float,
-    "episodes": int,
-    "length_mean": float,
-    "noop_max": int,
-    "eval_max_steps": int,
-}
 _DQN_ZOO = "google-deepmind/dqn_zoo dqn_zoo/atari_data.py"
 _NO_OPS = "mean of at least 3 games of at most 108,000 frames, after up to 30 no-ops"
 

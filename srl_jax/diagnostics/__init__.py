@@ -1,8 +1,8 @@
 """What a run's latent is like, measured at each evaluation: `diag/...` in the "eval" rows of metrics.jsonl.
 
-    measures.py   the measures, of numpy arrays          rows.py      what they say, out of metrics.jsonl
-    heldout.py    the observations that they look at     device.py    the functions of the device
-    measure.py    all of them, for one run               pictures.py  what objectives make of observations
+    run.py        all diagnostics of one run             heldout.py   the observations that they look at
+    measures.py   the measures, of numpy arrays          functions.py the functions of the device
+    drift.py      drift, read out of metrics.jsonl       pictures.py  what objectives make of observations
 
 Nothing is drawn from a run's own generators, and nothing that it trains with changes: without diagnostics a
 run is the same, to the bit.
@@ -17,7 +17,7 @@ Keys, each a number or a list of numbers; null where there is none:
     diag/error/NAME/moving, .../static  error of the newest frame on pixels that move, and on the others
     diag/error/NAME/moving_explained    1 - that on moving pixels / that of the mean image
     diag/moving_share                   the share of pixels that move
-    diag/gradient/NAME/cosine, .../norm_ratio   `srl_jax.update.make_conflict`, of one batch from replay
+    diag/gradient/NAME/cosine, .../norm_ratio   `functions.make_conflict`, of one batch from replay
     diag/probe/VARIABLE, diag/probe/mean        R^2 of a linear probe for a variable of the game's state
     wall_diag_s                         seconds that all of it took
 """

@@ -7,7 +7,7 @@ decoder that mirrors it, and all have the options `init`, `zero_sum`, `gain` and
 """
 
 from srl_jax.encoders.adapter import flax_encoder
-from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder
+from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder, starting
 from srl_jax.encoders.files import from_npz, to_npz
 from srl_jax.encoders.impala import impala
 from srl_jax.plugins import Registry
@@ -17,32 +17,19 @@ from srl_jax.types import Encoder
 __all__ = ["REGISTRY", "register", "flax_encoder", "from_npz", "impala", "nature", "sac_ae", "tiny", "to_npz"]
 
 
-def nature(
-    observation_shape: tuple[int, int, int],
-    *,
-    init: str = "pytorch",
-    zero_sum: bool = False,
-    gain: float = 1.0,
-    decoder_scale: float = 1.0,
-) -> Encoder:
+@starting
+def nature(observation_shape: tuple[int, int, int], start: Start) -> Encoder:
     """The encoder of Mnih et al. (2015): no bottleneck, 3,136 features at 84 x 84.
 
     Its decoder ends in a sigmoid, as in the thesis' code.
     """
     layers = [Layer(32, 8, 4), Layer(64, 4, 2), Layer(64, 3, 1)]
-    start = Start(init, zero_sum, gain, decoder_scale)
     return convolutional_encoder(observation_shape, layers, start, sigmoid=True)
 
 
+@starting
 def sac_ae(
-    observation_shape: tuple[int, int, int],
-    *,
-    features: int = 256,
-    layer_norm: bool = True,
-    init: str = "pytorch",
-    zero_sum: bool = False,
-    gain: float = 1.0,
-    decoder_scale: float = 1.0,
+    observation_shape: tuple[int, int, int], start: Start, *, features: int = 256, layer_norm: bool = True
 ) -> Encoder:
     """The thesis' larger encoder, after SAC-AE (Yarats et al. 2021, appendix B.2).
 
@@ -55,19 +42,11 @@ def sac_ae(
     """
     check_size("features", features)
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
-    start = Start(init, zero_sum, gain, decoder_scale)
     return convolutional_encoder(observation_shape, layers, start, features=features, layer_norm=layer_norm)
 
 
-def tiny(
-    observation_shape: tuple[int, int, int],
-    *,
-    features: int = 64,
-    init: str = "pytorch",
-    zero_sum: bool = False,
-    gain: float = 1.0,
-    decoder_scale: float = 1.0,
-) -> Encoder:
+@starting
+def tiny(observation_shape: tuple[int, int, int], start: Start, *, features: int = 64) -> Encoder:
     """A small encoder for tests and for Catch: two convolutions and a bottleneck.
 
     Args:
@@ -78,7 +57,6 @@ def tiny(
     """
     check_size("features", features, least=0)
     layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
-    start = Start(init, zero_sum, gain, decoder_scale)
     return convolutional_encoder(observation_shape, layers, start, features=features)
 
 

@@ -1,20 +1,26 @@
 """Convolutional encoders and the decoders that mirror them, as tables of layers."""
 
+import functools
+import inspect
 import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
 
 import flax.linen as nn
 import jax.numpy as jnp
 from jax import Array
 
 from srl_jax.encoders.adapter import flax_encoder
-from srl_jax.layers import INITIALISERS, Conv, ConvTranspose, Dense, WideDense
+from srl_jax.layers import INITIALISERS, Conv, ConvTranspose, Dense, Pads, WideDense
 from srl_jax.specs import choices_text
 from srl_jax.types import Encoder
 
 LEAST_SEEN = 0.95
 """The share of an image's side that the layers must see: a ball or a paddle may lie in what they do not."""
+
+
+EPSILON = 1e-5
+"""What LayerNorm adds to the variance."""
 
 
 class Layer(NamedTuple):
@@ -36,9 +42,6 @@ class Start(NamedTuple):
             tenths.
         decoder_scale: factor of the initial kernel of the decoder's last layer. At full size the first
             images are all contrast; a tenth starts near black.
-
-    Raises:
-        ValueError: from `check`, where a value is out of range.
     """
 
     init: str = "pytorch"
@@ -46,12 +49,32 @@ class Start(NamedTuple):
     gain: float = 1.0
     decoder_scale: float = 1.0
 
-    def check(self) -> None:
-        if self.init not in INITIALISERS:
-            raise ValueError(f"init: {choices_text(self.init, INITIALISERS)}")
+
+def starting(factory: Callable[..., Encoder]) -> Callable[..., Encoder]:
+    """A row of encoders: a factory of one from a `Start`, whose fields become options behind its own.
+
+    Args:
+        factory: (observation_shape, start, **options) -> Encoder.
+
+    Raises:
+        ValueError: from the row, where a value of `Start` is out of range.
+    """
+    shape, _, *own = inspect.signature(factory).parameters.values()
+
+    @functools.wraps(factory)
+    def row(observation_shape: tuple[int, int, int], **options: Any) -> Encoder:
+        start = Start(**{name: options.pop(name) for name in Start._fields if name in options})
+        if start.init not in INITIALISERS:
+            raise ValueError(f"init: {choices_text(start.init, INITIALISERS)}")
         for name in ("gain", "decoder_scale"):
-            if not 1e-3 <= getattr(self, name) <= 1e3:
+            if not 1e-3 <= getattr(start, name) <= 1e3:
                 raise ValueError(f"{name} must be at least 0.001 and at most 1000")
+        return factory(observation_shape, start, **options)
+
+    of_start = list(inspect.signature(Start).parameters.values())
+    options = [*own, *(p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in of_start)]
+    row.__dict__["__signature__"] = inspect.Signature([shape, *options])
+    return row
 
 
 class EncoderNetwork(nn.Module):
@@ -81,18 +104,15 @@ class EncoderNetwork(nn.Module):
         for i, layer in enumerate(self.layers):
             # The first kernel is multiplied by the gain, not the image: the same, with fewer bytes.
             first = i == 0
-            rows, columns = (
-                (0, max(0, (after - 1) * layer.stride + layer.kernel - before))
-                for before, after in zip(self.sizes[i], self.sizes[i + 1], strict=True)
-            )
-            conv = Conv(*layer, init, zero_sum and first, gain if first else 1.0, padding=(rows, columns))
+            padding = padding_between(self.sizes[i], self.sizes[i + 1], layer)
+            conv = Conv(*layer, init, zero_sum and first, gain if first else 1.0, padding=padding)
             x = nn.relu(conv(x))
         x = x.reshape(x.shape[0], -1)
         if not self.features:
             return x
         x = Dense(self.features)(x)
         if self.layer_norm:
-            x = nn.LayerNorm(epsilon=1e-5)(x)
+            x = nn.LayerNorm(epsilon=EPSILON)(x)
         return jnp.tanh(x)
 
 
@@ -160,9 +180,8 @@ def convolutional_encoder(
         sigmoid: whether the decoder ends in a sigmoid (in (0, 1)) or is linear at the end.
 
     Raises:
-        ValueError: where the image is too small for the layers, or `start` is out of range.
+        ValueError: where the image is too small for the layers.
     """
-    start.check()
     *sides, channels = observation_shape
     layers = tuple(layers)
     sizes = tuple(zip(*(layer_sides(side, layers) for side in sides), strict=True))
@@ -170,7 +189,31 @@ def convolutional_encoder(
     network = EncoderNetwork(layers, start, sizes, features, layer_norm)
     latent = features or math.prod(map_shape)
     decoder = DecoderNetwork(layers, start, sizes, channels, latent, bool(features), sigmoid)
-    return flax_encoder(network, decoder, observation_shape, map_shape=map_shape)
+    encoder = flax_encoder(network, decoder, observation_shape, map_shape=map_shape)
+    return encoder._replace(steps=tuple(steps(network)))
+
+
+def padding_between(before: tuple[int, int], after: tuple[int, int], layer: Layer) -> Pads:
+    """The zeros ((above, below), (left, right)) of a layer between two sizes (height, width)."""
+    below, right = (
+        max(0, (y - 1) * layer.stride + layer.kernel - x) for x, y in zip(before, after, strict=True)
+    )
+    return (0, below), (0, right)
+
+
+def steps(network: EncoderNetwork) -> Iterator[dict[str, Any]]:
+    """What a network computes of bytes, as `Encoder.steps`."""
+    yield {"step": "multiply", "by": network.start.gain / 255}
+    for i, layer in enumerate(network.layers):
+        padding = padding_between(network.sizes[i], network.sizes[i + 1], layer)
+        yield {"step": "conv", "parameters": f"Conv_{i}", "stride": layer.stride, "padding": padding}
+        yield {"step": "relu"}
+    yield {"step": "flatten"}
+    if network.features:
+        yield {"step": "dense", "parameters": "Dense_0"}
+        if network.layer_norm:
+            yield {"step": "layer_norm", "parameters": "LayerNorm_0", "epsilon": EPSILON}
+        yield {"step": "tanh"}
 
 
 def layer_sides(side: int, layers: Sequence[Layer]) -> list[int]:

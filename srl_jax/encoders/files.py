@@ -22,6 +22,13 @@ ABOUT = "about"
 def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec: str, **about: Any) -> None:
     """Writes an encoder's parameters, each by its path in the tree, as "Conv_0/kernel", and `ABOUT`.
 
+    `ABOUT` has "steps", where the encoder says them: what a program without this one has to compute of uint8
+    [B, H, W, S * C], one after the other. "multiply" has the number "by"; "conv" has "stride" and "padding",
+    zeros [[above, below], [left, right]], of a cross-correlation by `kernel` [height, width, in, out] plus
+    `bias`; "flatten" makes [B, D] in the order H, W, C; "dense" is x @ `kernel` + `bias`; "layer_norm" has
+    "epsilon", which is added to the variance, `scale` and `bias`; "relu" and "tanh" have nothing. A step's
+    "parameters" is what comes before the / of their names.
+
     Args:
         path: of the file; what lies there is replaced, once the new one is whole.
         encoder: whose they are.
@@ -41,6 +48,8 @@ def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec:
         raise ConfigError(f"{path}: the encoder {spec} has a parameter {ABOUT}, a name that the file needs")
     shape = list(encoder.observation_shape)
     text = {"encoder": spec, "observation_shape": shape, "features": encoder.features, **about}
+    if encoder.steps is not None:
+        text["steps"] = encoder.steps
     arrays[ABOUT] = np.array(json.dumps(text))
     partial = path.with_name(f".{path.name}.partial")
     try:

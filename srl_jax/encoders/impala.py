@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from srl_jax.encoders.adapter import flax_encoder
-from srl_jax.encoders.convolutional import Start
+from srl_jax.encoders.convolutional import Start, starting
 from srl_jax.layers import Conv, Dense, WideDense
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
@@ -114,15 +114,9 @@ def doubled(x: Array, size: tuple[int, int]) -> Array:
     return x.reshape(batch, 2 * height, 2 * width, channels)[:, : size[0], : size[1]]
 
 
+@starting
 def impala(
-    observation_shape: tuple[int, int, int],
-    *,
-    features: int = 256,
-    width: int = 1,
-    init: str = "pytorch",
-    zero_sum: bool = False,
-    gain: float = 1.0,
-    decoder_scale: float = 1.0,
+    observation_shape: tuple[int, int, int], start: Start, *, features: int = 256, width: int = 1
 ) -> Encoder:
     """IMPALA's larger encoder: 15 convolutions of 3 x 3 and a linear layer; for frames of any size.
 
@@ -137,8 +131,6 @@ def impala(
     """
     check_size("features", features)
     check_size("width", width)
-    start = Start(init, zero_sum, gain, decoder_scale)
-    start.check()
     rows, columns, depth = observation_shape
     channels, sizes = tuple(width * n for n in CHANNELS), [(rows, columns)]
     for _ in channels:

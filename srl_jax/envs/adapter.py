@@ -83,8 +83,10 @@ class Adapter(FrameVectorEnv):
         try:
             self._envs = [make_one() for _ in range(num_envs)]
         except Exception as error:
-            what = " ".join(str(error).split())
-            raise ConfigError(f"cannot be made: {type(error).__name__}: {what}") from error
+            what = " ".join(f"{type(error).__name__}: {error}".split())
+            if isinstance(error, ModuleNotFoundError):
+                what += " A file is found in the working directory, or by --import=PATH/FILE.py"
+            raise ConfigError(f"cannot be made: {what}") from error
         self._grey, self._render, self._skip, self._max_steps = grey, render, frame_skip, max_steps
         first = self._envs[0].unwrapped
         actions = _actions(first)

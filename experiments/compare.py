@@ -1,0 +1,245 @@
+"""Draws the curves of several runs: `srl-jax compare runs/a runs/b --key=eval/return_mean --out=ab.png`.
+
+Each argument is a run directory, a folder of seeds, or a folder of several arms; its runs may be packed. A
+curve is named by what its settings have that the others have not. Of several seeds, the mean and its 95 % t
+interval are drawn. A table has the last value and the area under the curve, and says which settings differ;
+without --out, it is all that is made.
+"""
+
+import os
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from absl import flags
+
+from srl_jax import display, specs, statistics
+from srl_jax.config import INFOS, Config
+from srl_jax.errors import ConfigError, SaveError
+from srl_jax.metrics import LEADING
+
+from . import collect, plots
+from . import flags as config_flags
+from .colours import styles
+from .run_data import RunData
+
+FLAGS = flags.FLAGS
+LONGEST = 40
+"""Characters of a label that says what differs; where it would be longer, it is the arm's name."""
+
+
+class Arm(NamedTuple):
+    """One arm on one game below one of the arguments.
+
+    Attributes:
+        game: what is played.
+        name: of the arm.
+        place: the directory of its first seed.
+        config: of that.
+        curves: env steps [N] and values [N] of each seed, at least one.
+        label: says in what it differs from the others.
+    """
+
+    game: str
+    name: str
+    place: str
+    config: Config
+    curves: list[tuple[np.ndarray, np.ndarray]]
+    label: str = ""
+
+
+def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[Arm], list[str]]:
+    """The arms below directories, and lines that say which runs are left out, or are of another protocol.
+
+    Args:
+        roots: the directories.
+        key: of metrics.jsonl, whose values are numbers.
+        force: whether games and protocols may differ.
+
+    Raises:
+        ConfigError: there is one curve, no run has the key, or runs cannot be compared.
+    """
+    found: list[list[RunData]] = []
+    for root in roots:
+        runs = collect.load_runs(root)
+        collect.check_arms(runs)
+        found += [members for arms in collect.grouped(runs).values() for members in arms.values()]
+    if len(found) < 2:
+        raise ConfigError(f"--runs={roots[0]}: one curve; name a second run, or a folder of several")
+    runs = [run for members in found for run in members]
+    known = {name for run in runs for row in run.rows for name in row} - {*LEADING[:2]}
+    if key not in known:
+        near = specs.near(key, known) or sorted(known)
+        raise ConfigError(f"--key={key}: no run has it; there are {', '.join(near)}")
+    if len(games := dict.fromkeys(run.game for run in runs)) > 1 and not force:
+        raise ConfigError(
+            f"--runs: of different games, {', '.join(games)}; --force compares them all the same"
+        )
+    notes = collect.check_protocols(runs, force=force) if key.startswith("eval/") else []
+    whys = {run.path: why for run, why in collect.left_out(runs, key)}
+    arms = []
+    for members in found:
+        path, game, name, _, config, *_ = members[0]
+        if out := {run.seed: whys[run.path] for run in members if run.path in whys}:
+            notes.append(f"{game}, {collect.left_out_text(name, out, len(members))}")
+        if curves := [collect.steps_and_values(run, key) for run in members if run.path not in whys]:
+            arms.append(Arm(game, name, str(path), config, curves))
+    if not arms:
+        raise ConfigError(f"--runs: nothing to draw; {'; '.join(notes)}")
+    return [arm._replace(label=label) for arm, label in zip(arms, _labels(arms), strict=True)], notes
+
+
+def _labels(arms: Sequence[Arm]) -> list[str]:
+    """The settings that tell arms of a game apart, the first ones that do; names where these are too long."""
+    labels = [""] * len(arms)
+    for flag, values in differing(arms).items():
+        longer = [f"{old}, {flag}={x}".removeprefix(", ") for old, x in zip(labels, values, strict=True)]
+        if len(set(longer)) > len(set(labels)):
+            labels = longer
+    if not all(0 < len(label) <= LONGEST for label in labels):
+        labels = [arm.name for arm in arms]
+    for other in ([arm.name for arm in arms], [arm.place for arm in arms]):
+        if len({(arm.game, label) for arm, label in zip(arms, labels, strict=True)}) < len(arms):
+            labels = other
+    return labels
+
+
+def differing(arms: Sequence[Arm]) -> dict[str, list[str]]:
+    """The settings that arms all have and in which they differ: {flag: its value in each}.
+
+    An option of a specification is a setting, too: rainbow:n_step. Games, and what seeds of an arm may differ
+    in, do not count.
+    """
+    each = [_settings(arm.config) for arm in arms]
+    shared = [name for name in each[0] if all(name in settings for settings in each)]
+    found = {name: [settings[name] for settings in each] for name in shared}
+    return {name: values for name, values in found.items() if len(set(values)) > 1}
+
+
+def _settings(config: Config) -> dict[str, str]:
+    found = {}
+    for field, info in INFOS.items():
+        flag, value = info.flag or field, getattr(config, field)
+        if field in ("rl", "encoder", "objectives"):
+            rows = [specs.split(text) for text in (value if isinstance(value, tuple) else (value,))]
+            found[flag] = "+".join(name for name, _ in rows) or "none"
+            found |= {f"{row}:{option}": text for row, options in rows for option, text in options.items()}
+        elif field not in ("game", *collect.OF_A_SEED):
+            found[flag] = _text(value)
+    return found
+
+
+def _text(value: Any) -> str:
+    """A setting; a small number as 1e-4."""
+    if isinstance(value, float) and 0 < abs(value) < 0.01:
+        digits, _, power = f"{value:e}".partition("e")
+        return f"{float(digits):g}e{int(power)}"
+    return "off" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def table(arms: Sequence[Arm], key: str) -> str:
+    """The last value and the area under the curve of each arm, and the settings in which arms differ.
+
+    Both are up to the last env step that all curves of a game have; the area is the mean over env steps.
+
+    Raises:
+        ConfigError: curves of a game have no env step in common.
+    """
+    lines = []
+    for game in dict.fromkeys(arm.game for arm in arms):
+        members = [arm for arm in arms if arm.game == game]
+        until = min(int(steps[-1]) for arm in members for steps, _ in arm.curves)
+        rows = [(f"{game}, {key}", "seeds", f"at {until:,} env steps", "area under the curve", "")]
+        for arm in members:
+            try:
+                ends = collect.ends(arm.curves, until).values()
+            except ValueError as error:
+                raise ConfigError(f"--runs: {arm.place}: {error}") from None
+            area, last = (_interval(statistics.estimate(statistics.mean, {game: x})) for x in ends)
+            rows.append((arm.label, str(len(arm.curves)), last, area, arm.place))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]
+        lines += [f"  {flag}: {', '.join(values)}" for flag, values in differing(members).items()]
+    return "\n".join(lines)
+
+
+def _interval(interval: statistics.Interval) -> str:
+    limits = "" if np.isnan(interval.low) else f" [{interval.low:.4g}, {interval.high:.4g}]"
+    return f"{interval.point:.4g}{limits}"
+
+
+def draw(arms: Sequence[Arm], key: str, notes: Sequence[str], path: Path, among: Iterable[str] = ()) -> None:
+    """Draws the curves, a panel a game.
+
+    An arm whose name is its own has the colour that it has in all figures of a directory; `among` is all arms
+    there.
+    """
+    names = {arm.label: arm.name for arm in arms}
+    own = len({*names.values()}) == len(names)
+    looks = styles(list(names.values() if own else names), among if own else ()).values()
+    panels = []
+    for game in dict.fromkeys(arm.game for arm in arms):
+        members = [arm for arm in arms if arm.game == game]
+        policies = plots.policy_levels(members[0].config) if key == collect.RETURN else ()
+        lines = [plots.Line(x.label, plots.interval_curve(x.curves), len(x.curves)) for x in members]
+        panels.append(plots.Panel(game, lines, (), policies))
+    bands = ["bands: 95 % t intervals over seeds"] if any(len(arm.curves) > 1 for arm in arms) else []
+    note = "\n".join([*bands, *notes])
+    plots.draw_panels(panels, path, "", note, dict(zip(names, looks, strict=True)), key)
+
+
+def define_flags(values: flags.FlagValues = FLAGS) -> None:
+    """Defines this entry point's flags."""
+    flags.DEFINE_multi_string(
+        "runs", None, "directories of runs, at least two curves; the name may be left out", flag_values=values
+    )
+    flags.DEFINE_string("key", collect.RETURN, "of metrics.jsonl, any with numbers", flag_values=values)
+    flags.DEFINE_string("out", "", "picture to write, which ends in .png", flag_values=values)
+    flags.DEFINE_boolean("overwrite", False, "replace the picture if there is one", flag_values=values)
+    flags.DEFINE_boolean(
+        "force", False, "compare runs of different games, or protocols of evaluation", flag_values=values
+    )
+
+
+def compare(values: flags.FlagValues) -> None:
+    """Checks the command line, reads the runs, draws them and prints the table.
+
+    Raises:
+        ConfigError: the command line or what the runs hold is not valid; nothing was written.
+        SaveError: the picture cannot be written.
+    """
+    if not values["runs"].value:
+        raise ConfigError("--runs: missing; name two, srl-jax compare runs/a runs/b")
+    roots = list(dict.fromkeys(Path(os.path.expanduser(root)) for root in values["runs"].value))
+    key, out = values["key"].value, values["out"].value
+    path = config_flags.check_file("out", out, ".png", overwrite=values["overwrite"].value) if out else None
+    if path and not plots.available():
+        raise ConfigError("--out: needs matplotlib and Pillow: pip install 'srl-jax[plots]'")
+    arms, notes = read(roots, key, force=values["force"].value)
+    text = table(arms, key)
+    for note in notes:
+        display.say(note)
+    if path:
+        try:
+            among = {name for root in roots for name in collect.arm_names(root)}
+            draw(arms, key, notes, path, among)
+        except OSError as error:
+            raise SaveError(f"--out={out}: {error.strerror}") from error
+    display.result(text)
+
+
+def main(argv: list[str]) -> None:
+    """The entry point."""
+    del argv
+    compare(FLAGS)
+
+
+def cli() -> None:
+    """Runs this entry point as a program."""
+    define_flags()
+    config_flags.run(main, positional="runs")
+
+
+if __name__ == "__main__":
+    cli()

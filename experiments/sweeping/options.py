@@ -1,0 +1,86 @@
+"""Flags of programs that run a sweep: who runs the runs, and what is given to all of them. Imports no jax."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from absl import flags
+
+from srl_jax import display
+from srl_jax.config import INFOS
+from srl_jax.errors import ConfigError
+from srl_jax.specs import Info, value_text
+
+from .. import flags as config_flags
+from ..presets import preset_values
+from . import plan
+
+_COUNTS = {
+    "workers": (Info(int, "runs at once; 0: one a core that has memory, and one on a GPU", minimum=0), 0),
+    "retries": (Info(int, "how often a run that crashed is resumed", minimum=0), 2),
+    "cpus_per_run": (Info(int, "cores that a run keeps to", "cores", minimum=1), 1),
+    "gpus_per_run": (Info(float, "of one GPU or several, with --launcher=ray", "GPUs", minimum=0), 0.0),
+}  # fmt: skip
+"""{flag: (what it may be, its default)}."""
+
+
+def define_flags(values: flags.FlagValues) -> None:
+    """Defines the flags of training that a sweep gives to its runs, and those that say how runs are run."""
+    config_flags.define_config_flags(values)
+    config_flags.define_runtime_flag(values)
+    flags.DEFINE_enum(
+        "launcher", "local", ["local", "ray"], "who runs the runs: this machine, or a Ray cluster",
+        flag_values=values,
+    )  # fmt: skip
+    for name, (info, default) in _COUNTS.items():
+        config_flags.define(name, info, default, values)
+    flags.DEFINE_string(
+        "ray_address",
+        None,
+        "of a Ray cluster that runs, HOST:PORT or auto; a new one on this machine if not given",
+        flag_values=values,
+    )
+    flags.DEFINE_boolean(
+        "dry_run", False, "print what would run and how long it would take, and exit", flag_values=values
+    )
+
+
+def launcher_options(values: flags.FlagValues) -> dict[str, Any]:
+    """What `launching.run_sweep` takes.
+
+    Raises:
+        ConfigError: a value is not valid, or not for this launcher.
+    """
+    found = {name: values[name].value for name in ("launcher", *_COUNTS, "ray_address")}
+    for name in ("gpus_per_run", "ray_address"):
+        if values[name].present and found["launcher"] == "local":
+            raise ConfigError(f"--{name}: only --launcher=ray takes it")
+    for name, (info, _) in _COUNTS.items():
+        try:
+            info.check(found[name])
+        except ValueError as error:
+            raise ConfigError(f"--{name}={found[name]}: {error}") from None
+    return found | {"workers": found["workers"] or None}
+
+
+def given_flags(values: flags.FlagValues) -> dict[str, str | tuple[str, ...]]:
+    """The flags of training that were given, as texts; `plan.plan` refuses those that it gives each run."""
+    names = [info.flag or name for name, info in INFOS.items()]
+    found: dict[str, str | tuple[str, ...]] = {}
+    for name in (*names, "preset", "config", "tune_runtime"):
+        if values[name].present:
+            value = values[name].value
+            text = tuple(value) if isinstance(value, list) else "off" if value is None else value_text(value)
+            found[name] = text
+    return found
+
+
+def say_what_is_replaced(values: flags.FlagValues, runs: Sequence[plan.Planned]) -> None:
+    """Says in a line which presets' objectives are replaced by those of --objective."""
+    given = values["objective"].value or ()
+    whose = [
+        preset
+        for preset in dict.fromkeys(run.preset for run in runs)
+        if config_flags.replaced_objectives(given, preset_values(preset).get("objectives", ()), preset)
+    ]
+    if whose:
+        display.say(config_flags.replaced_objectives(given, ("those",), ", ".join(whose)))

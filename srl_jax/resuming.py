@@ -1,0 +1,224 @@
+"""Where a run is resumed from, and whether what lies in a directory is a run at all. Imports no jax."""
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+
+from srl_jax import checkpoint, config, display, ending, loggers, provenance, rundir
+from srl_jax.checkpoint import Manifest
+from srl_jax.config import MAY_CHANGE, SOURCES, Config, another_run
+from srl_jax.errors import ConfigError, saving
+from srl_jax.metrics import read_metrics
+from srl_jax.reading import read_json
+
+
+def say(line: str) -> None:
+    """A line about resuming, for whoever watches."""
+    display.say(f"resume: {line}")
+
+
+def blank(path: Path) -> bool:
+    """Whether nothing lies there, or only what a process left that ended before its run's first row."""
+    if not path.is_dir():
+        return True
+    begun, rows = _is_config(path / config.FILE), path / "metrics.jsonl"
+    unwritten = begun and rows.is_file() and not rows.stat().st_size
+
+    def left(entry: Path) -> bool:
+        if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
+            return blank(entry)
+        if entry.name in (rundir.LOCK, f"{config.FILE}.partial"):
+            return True
+        if entry.is_symlink() or not begun:
+            return False
+        if entry.name == "encoders":  # what diagnostics keep of the first evaluation
+            return unwritten and all(kept.name == f"{0:09d}" for kept in _finished(entry))
+        if entry.name == "checkpoints":
+            return unwritten and not _finished(entry)
+        return entry.name == config.FILE or (unwritten and entry.name in ("metrics.jsonl", *loggers.WRITTEN))
+
+    return all(left(entry) for entry in path.iterdir())
+
+
+def _finished(folder: Path) -> list[Path]:
+    """What lies in a folder of checkpoints, but for what was not written to its end."""
+    return [entry for entry in folder.iterdir() if not entry.name.startswith(".")]
+
+
+def say_anew(path: Path) -> None:
+    """Says that the run of a directory without a checkpoint begins again, if one has begun there."""
+    if (path / config.FILE).exists():
+        say(f"{path}: no checkpoint there yet; the run begins again")
+
+
+def is_run(path: Path) -> bool:
+    """Whether the directory, or one of seeds in it, holds a config.json that this program wrote."""
+    return any(map(_is_config, (path / config.FILE, *sorted(path.glob(f"seed*/{config.FILE}")))))
+
+
+def _is_config(file: Path) -> bool:
+    try:
+        values = read_json(file)
+    except ConfigError:
+        return False
+    return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()
+
+
+def to_resume(path: Path, wanted: Config, at_most: int | None = None) -> Manifest | None:
+    """The checkpoint from which the run in a directory can be resumed; writes nothing.
+
+    Args:
+        path: of a run directory, or of one that is still to be made.
+        wanted: resolved.
+        at_most: env steps; newer checkpoints do not count.
+
+    Returns:
+        The manifest of the newest one that is whole, or None where the run has to begin. One without
+        `srl_jax.checkpoint.NUMBERS` among its files is of a run that has ended.
+
+    Raises:
+        ConfigError: another process writes there, or the run has another configuration, or its checkpoints
+            are all damaged, or gone though there were some.
+    """
+    rundir.check_free(path)
+    if blank(path):
+        say_anew(path)
+        return None
+    there, about = config.read(path)
+    if differing := another_run(there, wanted):
+        raise ConfigError(
+            f"--out={path}: the run there has another configuration: {differing}; srl-jax resume {path} "
+            "takes its own, name another directory, or --overwrite without --resume starts anew"
+        )
+    manifest = checkpoint.newest_good(path, say, at_most)
+    if manifest is None:
+        if (steps := reached(path)) >= first_checkpoint(wanted):
+            raise ConfigError(
+                f"--out={path}: the run there got to {steps} env steps, and there is no checkpoint to "
+                "resume it from; --overwrite would start anew"
+            )
+        say_anew(path)
+        return None
+    if differing := another_run(manifest.config, wanted):
+        raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
+    if checkpoint.NUMBERS not in manifest.files:
+        if wanted.steps > there.steps:
+            raise ConfigError(
+                f"--steps={wanted.steps}: the run in {path} has ended after {manifest.env_steps} env steps "
+                "and left no replay to resume with; --keep_replay beside training keeps it"
+            )
+        return manifest
+    if wanted.steps < manifest.env_steps:
+        raise ConfigError(
+            f"--steps={wanted.steps}: the run in {path} has done {manifest.env_steps} env steps already"
+        )
+    _say_changes(path, there, about, wanted)
+    return manifest
+
+
+def _say_changes(path: Path, there: Config, about: dict, wanted: Config) -> None:
+    """Says what is different from when the run in a directory began, or was last resumed.
+
+    Raises:
+        ConfigError: what config.json says of versions is not what training writes.
+    """
+    if wanted.steps != there.steps:
+        say(f"{path}: --steps was {there.steps} and is {wanted.steps}{_by_the_end(wanted)}")
+    with contextlib.suppress(ConfigError):  # it informs and decides nothing
+        if (ended := ending.read(path)) is not None and ended.status == "diverged":
+            say(f"{path}: ended since {ended.reason}; the same code on the same machine gets there again")
+    for flag in SOURCES:
+        then, now = getattr(there, flag), getattr(wanted, flag)
+        if then != now:
+            how = "the run resumes with the latter" if flag == "policy_from" else "neither is read any more"
+            say(f"{path}: --{flag} was {then} and is {now}: {how}")
+    if changed := _changes(path, about):
+        what = ", ".join(
+            f"{name} was {then!r:.200} and is {now!r:.200}" for name, (then, now) in changed.items()
+        )
+        say(f"{path}: {what}: results may differ from those of a run that did not end")
+
+
+def _by_the_end(wanted: Config) -> str:
+    """What of a run depends on how long it is, for the line that says that this has changed."""
+    found = []
+    if wanted.lr_final_share != 1.0:
+        found.append("learning rates fall to --lr_final_share by the new end")
+    if wanted.diagnostics and wanted.diagnostics_kept:
+        found.append("drift is measured against encoders spread over the new length")
+    return f"; {' and '.join(found)}" if found else ""
+
+
+def _changes(path: Path, about: dict) -> dict[str, tuple]:
+    """`srl_jax.provenance.changes` of a run directory's config.json."""
+    try:
+        return provenance.changes(about)
+    except ValueError as error:
+        raise ConfigError(f"{path / config.FILE}: {error}") from None
+
+
+@contextlib.contextmanager
+def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[None]:
+    """Holds the directory of a run that is resumed, whose config.json is brought up to date.
+
+    The settings of `MAY_CHANGE` take their new values; what else has changed is under "continued". Where
+    nothing has, nothing is written.
+
+    Args:
+        path: the directory.
+        manifest: of the checkpoint from which it is resumed.
+        resumed: the configuration that it is resumed with.
+
+    Raises:
+        ConfigError: another process writes there.
+        SaveError: config.json could not be written.
+    """
+    with rundir.held(path):
+        there, about = config.read(path)
+        values = {name: getattr(resumed, name) for name in MAY_CHANGE}
+        settings = {name: value for name, value in values.items() if getattr(there, name) != value}
+        changed = {name: now for name, (_, now) in _changes(path, about).items()}
+        if settings or changed:
+            now = {"env_steps": manifest.env_steps, "started": provenance.now()}
+            continued = [*about.get("continued", []), {**now, "changed": changed, "settings": settings}]
+            with saving(f"--out={path}"):
+                config.write(path, {**about, **settings, "continued": continued})
+        yield
+
+
+def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
+    """`to_resume` of runs that are resumed in step: checkpoints of the same env step, or None for all.
+
+    Raises:
+        ConfigError: one cannot be resumed, or it would have to begin again and another one got further.
+    """
+    at_most = None
+    while True:
+        found = [to_resume(path, wanted, at_most) for path, wanted in runs]
+        steps = [manifest.env_steps for manifest in found if manifest is not None]
+        if len(steps) < len(runs):
+            first, wanted = runs[found.index(None)]
+            for (path, _), manifest in zip(runs, found, strict=True):
+                never = not (first / config.FILE).exists()
+                if manifest and (never or manifest.env_steps >= first_checkpoint(wanted)):
+                    raise ConfigError(
+                        f"--out={first}: no checkpoint there to resume from, while {path} has one of "
+                        f"{manifest.env_steps} env steps; --overwrite would start all of them anew"
+                    )
+            return [None] * len(runs)
+        if len(set(steps)) == 1:
+            return found
+        at_most = min(steps)
+
+
+def first_checkpoint(wanted: Config) -> int:
+    """Env steps at which the first checkpoint is on disk for certain."""
+    return (wanted.checkpoint_every or wanted.eval_every) + wanted.num_envs
+
+
+def reached(path: Path) -> int:
+    """The env steps of a run's last row, or 0."""
+    try:
+        return max((int(row["env_steps"]) for row in read_metrics(path / "metrics.jsonl")), default=0)
+    except (OSError, ValueError, KeyError, TypeError):
+        return 0

@@ -1,0 +1,145 @@
+"""Tests of experiments.compare."""
+
+import json
+
+import pytest
+from absl import flags
+
+from experiments import collect, compare, packing, plots
+from experiments import flags as config_flags
+from experiments.colours import styles
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
+from tests.helpers import NOT_FINITE, write_run
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory):
+    """Two seeds of a, which end at 200 env steps; b, with another rate, goes on to 300; c is joint."""
+    root = tmp_path_factory.mktemp("runs")
+    write_run(root / "a/seed0", (-1, 0, 1), lr_rl=1e-3)
+    write_run(root / "a/seed1", (-1, -1, 0), seed=1, lr_rl=1e-3)
+    write_run(root / "b", (0, 1, 1, 5), lr_rl=1e-4)
+    write_run(root / "c", (0, 0), lr_rl=1e-4, mode="joint", objectives=("latent_l2:weight=1e-5",))
+    write_run(root / "pong", (0, 0), game="Pong", frame_size=84)
+    write_run(root / "noisy", (0, 0), eps_eval=0.5)
+    write_run(root / "failed", (0, 0), ended=NOT_FINITE)
+    rows = [json.loads(line) for line in (root / "c/metrics.jsonl").read_text().splitlines()]
+    rows[0] |= {"loss/x": 0.5, "text": "x"}
+    (root / "c/metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    return root
+
+
+def _compare(*arguments):
+    values = flags.FlagValues()
+    compare.define_flags(values)
+    config_flags.parse(["compare", *map(str, arguments)], values, "runs")
+    compare.compare(values)
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """The panels and looks of what was drawn."""
+    pytest.importorskip("matplotlib")
+    given, draw = [], plots.draw_panels
+
+    def keep(panels, path, title, note, looks, label):
+        given.append((panels, note, looks))
+        return draw(panels, path, title, note, looks, label)
+
+    monkeypatch.setattr(plots, "draw_panels", keep)
+    return given
+
+
+def test_the_table_by_hand(runs, capsys):
+    _compare(runs / "a", runs / "b")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    # Of a at 200: 1 and 0, so 0.5, and 12.706 times a standard error of 0.5 to either side. Averages over
+    # 0 .. 200 are 0 and -0.75 of a, and (0.5 + 1) / 2 of b, which goes on.
+    assert lines[0][:5] == ["Catch,", "eval/return_mean", "seeds", "at", "200"]
+    assert lines[1][:6] == ["lr_rl=1e-3", "2", "0.5", "[-5.853,", "6.853]", "-0.375"]
+    assert lines[2] == ["lr_rl=1e-4", "1", "1", "0.75", str(runs / "b")]
+    assert lines[3:] == [["lr_rl:", "1e-3,", "1e-4"]]
+
+
+def test_the_picture_has_means_intervals_and_names(runs, tmp_path, drawn):
+    path = tmp_path / "ab.png"
+    _compare(runs / "a", runs / "b", f"--out={path}")
+    assert path.read_bytes().startswith(b"\x89PNG")
+    (((panel,), note, looks),) = drawn
+    a, b = panel.lines
+    assert (a.label, a.seeds, b.label, b.seeds) == ("lr_rl=1e-3", 2, "lr_rl=1e-4", 1)
+    assert list(a.curve.point) == [-1, -0.5, 0.5] and a.curve.high[2] == pytest.approx(6.853, abs=1e-3)
+    assert list(b.curve.at) == [0, 100, 200, 300] and note.startswith("bands: 95 % t intervals")
+    assert {level.method for level in panel.policies} == {"random", "no-op"}
+    # The colours of a and b among all arms that were named, and not of what their labels happen to be.
+    assert looks == dict(zip(("lr_rl=1e-3", "lr_rl=1e-4"), styles(["a", "b"]).values(), strict=True))
+    before = path.read_bytes()
+    _compare(runs / "b", runs / "c", "--key=loss/x", f"--out={path}", "--overwrite")
+    assert path.read_bytes() != before and not drawn[1][0][0].policies
+    assert "Catch, b: 1 of 1 seed left out: has no loss/x" in drawn[1][1]
+
+
+def _arms(*configs):
+    return [compare.Arm("Catch", f"arm{i}", f"runs/arm{i}", config, []) for i, config in enumerate(configs)]
+
+
+def test_labels_are_the_first_settings_that_tell_arms_apart():
+    joint = {"mode": "joint", "objectives": ("reconstruction:weight=1",)}
+    light = {"mode": "joint", "objectives": ("reconstruction:weight=0.1", "latent_l2:weight=1")}
+    arms = _arms(Config(), Config(**joint), Config(**light))
+    assert compare.differing(arms).keys() == {"mode", "objective"}
+    assert compare._labels(arms) == ["arm0", "arm1", "arm2"]  # the objectives are too long
+    arms = _arms(*(Config(mode="joint", objectives=(f"reconstruction:weight={x}",)) for x in (1, 2)))
+    assert compare._labels(arms) == ["reconstruction:weight=1", "reconstruction:weight=2"]
+    assert compare._labels(_arms(Config(), Config(seed=1))) == ["arm0", "arm1"]
+    same = [arm._replace(name="x") for arm in _arms(Config(), Config())]
+    assert compare._labels(same) == ["runs/arm0", "runs/arm1"]
+    same[1] = same[1]._replace(game="Pong")  # in panels of their own
+    assert compare._labels(same) == ["x", "x"]
+
+
+def test_packed_runs_and_folders_of_arms_are_read_alike(runs, tmp_path, capsys):
+    for name in ("a", "b"):
+        read = collect.load_runs(runs / name)
+        packing.write(tmp_path / name, [x._replace(path=tmp_path / name / x.path.name) for x in read])
+    _compare(tmp_path)
+    here = capsys.readouterr().out
+    _compare(runs / "a", runs / "b")
+    assert [line.split()[:4] for line in here.splitlines()] == [
+        line.split()[:4] for line in capsys.readouterr().out.splitlines()
+    ]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((), "--runs: missing; name two"),
+        (("a",), "--runs=.*a: one curve; name a second run"),
+        (("a", "a/"), "--runs=.*a: one curve; name a second run"),
+        (("a", "nothing"), "nothing: no run directory there"),
+        (("a", "b", "--key=eval/return_men"), "no run has it; there are eval/return_mean"),
+        (("a", "c", "--key=text"), "c: text is not a number in each row"),
+        (("a", "pong"), "of different games, Catch, Pong; --force compares"),
+        (("a", "noisy"), "another protocol than .*eps_eval is 0.005 there and 0.5 here; --force"),
+        (
+            ("failed", "failed/../failed"),
+            "nothing to draw; Catch, failed: 1 of 1 seed left out: loss/rl is not finite",
+        ),
+        (("a", "b", "--out=x.jpg"), "--out=x.jpg: must end in .png"),
+        (("a", "b", "--out=there.png"), "there.png: exists; name a new file, or --overwrite replaces it"),
+    ],
+)
+def test_what_cannot_be_compared_is_refused_and_nothing_written(runs, monkeypatch, arguments, message):
+    monkeypatch.chdir(runs)
+    (runs / "there.png").write_bytes(b"")
+    with pytest.raises(ConfigError, match=message):
+        _compare(*arguments)
+    assert (runs / "there.png").read_bytes() == b""
+
+
+def test_games_that_differ_have_panels_of_their_own_where_that_is_forced(runs, tmp_path, drawn):
+    _compare(runs / "a", runs / "pong", "--force", f"--out={tmp_path / 'x.png'}")
+    assert [panel.game for panel in drawn[0][0]] == ["Catch", "Pong"]
+    _compare(runs / "a", runs / "noisy", "--force", f"--out={tmp_path / 'y.png'}")
+    assert "another protocol" in drawn[1][1]

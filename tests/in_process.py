@@ -1,0 +1,82 @@
+"""The command line in this process: flags of its own, errors caught, and a stub in place of the loop."""
+
+import os
+import pathlib
+import subprocess
+import sys
+import types
+
+import numpy as np
+import pytest
+from absl import flags
+
+from experiments import flags as config_flags
+from experiments import train
+from srl_jax import checkpoint
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
+
+ROOT = pathlib.Path(__file__).resolve().parents[1]
+CATCH = ["--game=Catch", "--encoder=tiny", "--frame_size=42", "--steps=500", "--checkpoint_every=100"]
+CATCH += ["--nodiagnostics"]
+
+
+class Loop(types.ModuleType):
+    """Stands in for srl_jax.loop."""
+
+    def __init__(self):
+        super().__init__("srl_jax.loop")
+        self.calls = []
+        self.resumed = []
+        self.seeds = []
+
+    def train_seeds(self, config, seeds, outs, *, resume, stop):
+        self.seeds.append(seeds)
+        manifests = resume or [None] * len(outs)
+        return [self.train(config, out, resume=m, stop=stop) for out, m in zip(outs, manifests, strict=True)]
+
+    def train(self, config, out, *, resume=None, stop):
+        assert not stop()
+        self.calls.append((config, out))
+        self.resumed.append(resume)
+        (pathlib.Path(out) / "metrics.jsonl").touch()
+        return types.SimpleNamespace(
+            env_steps=0, updates=0, interrupted=False, saved=None, pictures={}, recording=None
+        )
+
+
+def parse(arguments):
+    values = flags.FlagValues()
+    train.define_flags(values)
+    config_flags.parse(["train", *arguments], values)
+    return values
+
+
+def train_in_process(*arguments):
+    """What the entry point does, in this process and with flags of its own."""
+    try:
+        return train.train(parse(arguments))
+    except ConfigError as error:
+        config_flags.fail(error)
+
+
+def python(*arguments, **env):
+    options = {"cwd": ROOT, "env": os.environ | env, "capture_output": True, "text": True, "timeout": 60}
+    return subprocess.run([sys.executable, *arguments], **options)
+
+
+def refused(capsys, *arguments):
+    with pytest.raises(SystemExit) as ended:
+        train_in_process("--game=Catch", *arguments)
+    assert ended.value.code == 2
+    line = capsys.readouterr().err
+    assert line.count("\n") == 1
+    return line
+
+
+def checkpoint_of(out, env_steps, ended=False):
+    """A checkpoint of the run in a directory, as the loop writes it."""
+    params = {"encoder": {"kernel": np.ones(2, np.float32)}}
+    state = None if ended else checkpoint.State({}, {}, {})
+    counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": env_steps, "updates": 1}
+    return checkpoint.save(out, params, Config.load(out), state=state, **counts)

@@ -1,0 +1,365 @@
+"""Tests of experiments.train and experiments.resume: where a run is written, and from where it goes on."""
+
+import importlib.util
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+import types
+
+import pytest
+
+from experiments import resume, train
+from srl_jax import checkpoint, rundir
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
+from srl_jax.metrics import read_metrics, strip_wall
+from tests.helpers import SMALL
+from tests.in_process import CATCH, ROOT, checkpoint_of, refused, train_in_process
+
+JOINT = ["--game=Catch", "--mode=joint", "--objective=reconstruction"]
+
+
+def test_seeds_get_a_run_directory_each(loop, tmp_path):
+    train_in_process("--game=Catch", "--seeds=4,0", f"--out={tmp_path / 'runs'}")
+    assert [out.name for _, out in loop.calls] == ["seed4", "seed0"]
+    seeds = [Config.load(tmp_path / "runs" / name).seed for name in ("seed4", "seed0")]
+    assert seeds == [4, 0]
+
+
+def test_out_is_needed(capsys, loop):
+    assert "--out: missing" in refused(capsys)
+    assert "--out: missing" in refused(capsys, "--out=")
+
+
+def test_out_that_cannot_be_made(capsys, loop, tmp_path, monkeypatch):
+    file = tmp_path / "file"
+    file.write_text("mine")
+    assert "not a directory" in refused(capsys, f"--out={file}")
+    assert "not a directory" in refused(capsys, f"--out={file}/below")
+    # The system refuses such a name only after its parent was made; the parent must go again.
+    assert "--out=" in refused(capsys, f"--out={tmp_path}/parent/{'x' * 300}")
+    assert list(tmp_path.iterdir()) == [file] and file.read_text() == "mine"
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    assert "no permission" in refused(capsys, f"--out={tmp_path}/new")
+    (tmp_path / "empty").mkdir()
+    assert "no permission" in refused(capsys, f"--out={tmp_path}/empty")
+    assert loop.calls == []
+
+
+def test_a_directory_with_files_is_kept(capsys, loop, tmp_path):
+    (tmp_path / "config.json").write_text("{}")
+    assert "not empty" in refused(capsys, f"--out={tmp_path}")
+    # Somebody else's config.json does not make it a run.
+    assert "not a run directory" in refused(capsys, f"--out={tmp_path}", "--overwrite")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
+    assert loop.calls == []
+
+
+def test_overwrite_replaces_a_run_but_not_what_it_starts_from(capsys, loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    train_in_process("--game=Catch", f"--out={out}")
+    (out / "metrics.jsonl").write_text("{}")
+    (out / "checkpoints").mkdir()
+    start = ["--mode=finetuned", f"--encoder_from={out}/checkpoints"]
+    line = refused(capsys, f"--out={out}", "--overwrite", *start)
+    assert "--overwrite would delete --encoder_from" in line
+    monkeypatch.chdir(out)
+    assert "working directory" in refused(capsys, f"--out={out}", "--overwrite")
+    monkeypatch.chdir(tmp_path)
+    assert (out / "metrics.jsonl").exists()
+    train_in_process("--game=Catch", "--seed=1", f"--out={out}", "--overwrite")
+    assert {path.name for path in out.iterdir()} == {"config.json", "metrics.jsonl"}
+    assert (out / "metrics.jsonl").read_text() == ""  # the new run's
+    assert Config.load(out).seed == 1
+
+
+def test_a_run_starts_with_its_config_written(loop, tmp_path):
+    out = tmp_path / "runs" / "a"
+    train_in_process(*JOINT, "--objective=latent_l2:weight=1e-6", f"--out={out}")
+    ((config, path),) = loop.calls
+    assert path == out
+    assert Config.load(out) == config
+    assert config.objectives == ("reconstruction:weight=1.0", "latent_l2:weight=1e-06")
+    assert "n_step=3" in config.rl
+    assert json.loads((out / "config.json").read_text())["versions"]["python"]
+
+
+def test_a_config_that_the_loop_refuses_leaves_nothing(capsys, loop, tmp_path, monkeypatch):
+    def refuse(config, out, **_):
+        raise ConfigError("--encoder_from=x: another architecture")
+
+    monkeypatch.setattr(loop, "train", refuse)
+    line = refused(capsys, f"--out={tmp_path}/runs/a")
+    assert line == "error: --encoder_from=x: another architecture\n"
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "empty").mkdir()
+    refused(capsys, f"--out={tmp_path}/empty")
+    assert list((tmp_path / "empty").iterdir()) == []
+
+
+def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    resume = [*CATCH, f"--out={out}", "--resume=auto"]
+    assert train_in_process(*resume) == 0  # a new directory
+    assert Config.load(out).steps == 500
+    assert train_in_process(*resume) == 0  # killed before its first checkpoint
+    assert "no checkpoint there yet; the run begins again" in capsys.readouterr().err
+    made = checkpoint_of(out, 200)
+    (out / "metrics.jsonl").write_text("kept")
+    assert train_in_process(*resume) == 0
+    assert loop.resumed == [None, None, made]
+    assert (out / "metrics.jsonl").read_text() == "kept" and made == checkpoint.read_manifest(out)
+    assert not (out / "lock").exists()
+    # Without the flag, nothing is touched, as before.
+    assert "--resume=auto resumes the run" in refused(capsys, *CATCH[1:], f"--out={out}")
+
+
+def test_a_start_that_failed_is_in_nobodys_way(capsys, loop, tmp_path, monkeypatch):
+    def failed(config, out, **_):
+        (out / "metrics.jsonl").touch()
+        raise RuntimeError("a mistake")
+
+    out = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "train", failed)
+        with pytest.raises(RuntimeError):
+            train_in_process(*CATCH, "--rl=:n_step=7", f"--out={out}")
+    assert (out / "config.json").exists()
+    capsys.readouterr()
+    for arguments in ([], ["--resume=auto"]):
+        assert train_in_process(*CATCH, "--rl=:n_step=6", f"--out={out}", *arguments) == 0
+        assert "n_step=6" in Config.load(out).rl
+        assert capsys.readouterr().err == (f"resume: {out}: no checkpoint there yet; the run begins again\n")
+
+
+def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    checkpoint_of(out, 200)
+    before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*"))
+    resume = [*CATCH[1:], f"--out={out}", "--resume=auto"]
+    assert "--resume=auto: resumes the run that --overwrite deletes" in refused(
+        capsys, *resume, "--overwrite"
+    )
+    line = refused(capsys, *resume, "--seed=7", "--gamma=0.5")
+    assert "another configuration: seed is 0 there and 7 here, gamma is 0.99 there and 0.5 here" in line
+    with rundir.held(out):
+        assert f"process {os.getpid()} on" in refused(capsys, *resume)
+    assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*")) == before
+    foreign = tmp_path / "foreign"
+    foreign.mkdir()
+    (foreign / "notes.txt").write_text("mine")
+    line = refused(capsys, *CATCH[1:], f"--out={foreign}", "--resume=auto")
+    assert "not a run directory, so --resume=auto cannot resume it" in line
+    assert [p.name for p in foreign.iterdir()] == ["notes.txt"]
+    assert len(loop.calls) == 1
+
+
+def test_a_run_goes_on_without_the_one_that_it_started_from(capsys, loop, tmp_path):
+    pre, out = tmp_path / "pre", tmp_path / "run"
+    objective = "--objective=reconstruction"
+    train_in_process(*CATCH, "--mode=pretrain", objective, f"--out={pre}")
+    checkpoint_of(pre, 500, ended=True)
+    frozen = [*CATCH, "--mode=frozen", f"--out={out}", "--resume=auto"]
+    train_in_process(*frozen, f"--encoder_from={pre}")
+    made = checkpoint_of(out, 200)
+    pre.rename(tmp_path / "moved")
+    capsys.readouterr()
+    for source in (pre, tmp_path / "moved", os.path.relpath(tmp_path / "moved")):
+        assert train_in_process(*frozen, f"--encoder_from={source}") == 0
+        assert loop.resumed[-1] == made
+        said = capsys.readouterr().err
+        assert ("neither is read any more" in said) == (source != pre) and said.count("\n") <= 1
+    # What has to begin needs it.
+    line = refused(
+        capsys, *CATCH[1:], "--mode=frozen", f"--encoder_from={pre}", "--resume=auto", f"--out={tmp_path}/new"
+    )
+    assert f"--encoder_from={pre}: no such path" in line and not (tmp_path / "new").exists()
+
+
+def test_pretraining_goes_on_with_the_policy_that_it_needs(capsys, loop, tmp_path):
+    policy, out = tmp_path / "policy", tmp_path / "run"
+    train_in_process(*CATCH, f"--out={policy}")
+    checkpoint_of(policy, 500, ended=True)
+    pretrain = [*CATCH, "--mode=pretrain", "--objective=reconstruction", f"--out={out}", "--resume=auto"]
+    train_in_process(*pretrain, f"--policy_from={policy}")
+    made = checkpoint_of(out, 200)
+    policy.rename(tmp_path / "moved")
+    capsys.readouterr()
+    line = refused(capsys, *pretrain[1:], f"--policy_from={policy}")
+    assert line == (f"error: --policy_from={policy}: no such path; give a run directory or a checkpoint\n")
+    assert train_in_process(*pretrain, f"--policy_from={tmp_path}/moved") == 0 and loop.resumed[-1] == made
+    assert "the run resumes with the latter" in capsys.readouterr().err
+
+
+def test_two_processes_do_not_write_one_run(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    for flag in ("--overwrite", "--resume=auto"):
+        with rundir.held(out):
+            line = refused(capsys, *CATCH[1:], f"--out={out}", flag)
+        assert f"process {os.getpid()} on" in line and "is writing there" in line
+        assert (out / "metrics.jsonl").exists() and Config.load(out).steps == 500
+    assert len(loop.calls) == 1
+
+
+def test_a_run_that_has_ended_says_so(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    checkpoint_of(out, 500, ended=True)
+    capsys.readouterr()
+    assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
+    assert capsys.readouterr().out == f"the run in {out} has ended: 500 env steps\n"
+    assert len(loop.calls) == 1
+
+
+def test_seeds_go_on_together(capsys, loop, tmp_path):
+    arguments = [*CATCH, f"--out={tmp_path}/runs", "--resume=auto"]
+    train_in_process(*arguments, "--seeds=4,0")
+    for seed, env_steps in ((4, 100), (0, 100), (4, 200)):
+        checkpoint_of(tmp_path / "runs" / f"seed{seed}", env_steps)
+    train_in_process(*arguments, "--seeds=4,0")
+    assert loop.seeds == [[4, 0]] * 2
+    assert [m and m.env_steps for m in loop.resumed] == [None, None, 100, 100]
+    line = refused(capsys, *arguments[1:], "--seeds=4,0,1")
+    assert "seed1: no checkpoint there" in line
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGUSR1])
+def test_a_run_that_was_stopped_says_how_to_go_on(capsys, loop, tmp_path, monkeypatch, number):
+    def stopped(config, out, *, resume, stop):
+        assert not stop()
+        (out / "metrics.jsonl").touch()
+        os.kill(os.getpid(), number)
+        assert stop()
+        if number != signal.SIGTERM:
+            os.kill(os.getpid(), signal.SIGTERM)
+        with pytest.raises(KeyboardInterrupt):  # who asks twice does not wait
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(10)
+        return types.SimpleNamespace(
+            env_steps=40, updates=0, interrupted=True, saved=40, pictures={}, recording=None
+        )
+
+    monkeypatch.setattr(loop, "train", stopped)
+    handlers = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert train_in_process(*CATCH, f"--out={tmp_path}/run") == 128 + number
+    assert capsys.readouterr().out.endswith(
+        f"stopped after 40 env steps; srl-jax resume {tmp_path}/run resumes from there\n"
+    )
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == handlers
+
+
+def test_resume_needs_nothing_but_the_directory(loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, "--lr_rl=1e-3", "--objective=inverse", "--mode=joint", f"--out={out}")
+    manifest = checkpoint_of(out, 100)
+    train_in_process(*resume.command_line(str(out)))
+    (_, (config, path)) = loop.calls
+    assert (config, path) == (Config.load(out), out)
+    assert loop.resumed[-1].path == checkpoint.read_manifest(out).path and manifest
+
+
+def test_resume_finds_the_seeds_of_a_process(loop, tmp_path):
+    for seed in (10, 2):
+        train_in_process(*CATCH, f"--seed={seed}", f"--out={tmp_path}/runs/seed{seed}")
+    assert resume.command_line(f"{tmp_path}/runs") == [
+        f"--config={tmp_path}/runs/seed2/config.json", "--seeds=2,10", f"--out={tmp_path}/runs",
+        "--resume=auto",
+    ]  # fmt: skip
+
+
+def test_resume_refuses_what_is_no_run(tmp_path):
+    with pytest.raises(ConfigError, match="not a run directory"):
+        resume.command_line(str(tmp_path))
+    (tmp_path / "sweep.json").touch()
+    with pytest.raises(ConfigError, match="a sweep, which srl-jax sweep --out="):
+        resume.command_line(str(tmp_path))
+    with pytest.raises(ConfigError, match="^name a run directory first: srl-jax resume runs/NAME$"):
+        resume.main(["resume"])
+
+
+SHORT = SMALL | {"steps": 600, "eval_every": 200}
+RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=off"]
+
+
+def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys, monkeypatch):
+    from srl_jax import loop
+
+    out, command = tmp_path / "run", [sys.executable, "-m", "experiments.train", *RUN]
+    first = subprocess.Popen(
+        [*command, f"--out={out}"], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    metrics = out / "metrics.jsonl"
+    deadline = time.monotonic() + 120
+    while not (metrics.exists() and b"loss/rl" in metrics.read_bytes()):
+        assert first.poll() is None and time.monotonic() < deadline, first.communicate()
+        time.sleep(0.02)
+    with pytest.raises(ConfigError, match=f"process {first.pid} on"):
+        rundir.check_free(out)
+    first.send_signal(signal.SIGTERM)
+    printed, _ = first.communicate(timeout=120)
+    assert first.returncode == 128 + signal.SIGTERM
+    stopped = checkpoint.read_manifest(out).env_steps
+    assert 80 <= stopped < 600
+    line = f"stopped after {stopped} env steps; srl-jax resume {out} resumes from there"
+    assert line in printed.splitlines()
+
+    monkeypatch.setattr(train, "draw", lambda *_: None)  # figures have tests of their own
+    assert train_in_process(*resume.command_line(str(out)), "--tune_runtime=off") == 0
+    assert f"600 env steps, 70 updates; everything is in {out}" in capsys.readouterr().out
+    whole = tmp_path / "whole"
+    whole.mkdir()
+    loop.train(Config.load(out), whole, progress=False)
+    rows = [[strip_wall(row) for row in read_metrics(path / "metrics.jsonl")] for path in (out, whole)]
+    assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 600
+    assert checkpoint.read_manifest(out).files == checkpoint.read_manifest(whole).files
+
+
+def test_a_flag_that_a_game_has_no_use_for_is_named(capsys, loop, tmp_path):
+    train_in_process("--game=Catch", "--sticky_actions=0.25", f"--out={tmp_path}/a")
+    assert "--sticky_actions: changes nothing, Catch has none" in capsys.readouterr().err
+    train_in_process("--game=Pong", "--sticky_actions=0.25", f"--out={tmp_path}/b")
+    train_in_process("--preset=catch/rl_only", f"--out={tmp_path}/c")
+    assert "changes nothing" not in capsys.readouterr().err
+
+
+def test_a_game_that_cannot_be_made_leaves_nothing(capsys, loop, tmp_path):
+    with pytest.raises(SystemExit):
+        train_in_process("--game=nonesuch_module:E-v0", f"--out={tmp_path}/a")
+    line = capsys.readouterr().err
+    assert "--game=nonesuch_module:E-v0: cannot be made: ModuleNotFoundError: No module named" in line
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_extra_that_is_missing_is_named(capsys, loop, tmp_path, monkeypatch):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(SystemExit):
+        train_in_process("--game=Pong", f"--out={tmp_path}/a")
+    assert "--game=Pong: Atari needs ale-py" in capsys.readouterr().err
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    assert "needs wandb: pip install wandb" in refused(capsys, "--logger=wandb", f"--out={tmp_path}/a")
+
+
+def test_a_dry_run_says_what_would_be_done_and_writes_nothing(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    assert train_in_process(*CATCH, "--dry_run", f"--out={out}", "--seeds=3,4") == 0
+    printed = capsys.readouterr()
+    config = Config.from_json(printed.out)
+    assert config.steps == 500 and "n_step=3" in config.rl
+    assert printed.err == "".join(
+        f"dry run: nothing is written; a run would begin in {out}/seed{seed}\n" for seed in (3, 4)
+    )
+    assert loop.calls == [] and list(tmp_path.iterdir()) == []
+    train_in_process(*CATCH, f"--out={out}")
+    checkpoint_of(out, 200)
+    capsys.readouterr()
+    before = sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*"))
+    assert train_in_process(*CATCH, "--dry_run", f"--out={out}", "--resume=auto") == 0
+    assert f"a run would resume from 200 env steps in {out}\n" in capsys.readouterr().err
+    assert "not empty" in refused(capsys, *CATCH[1:], "--dry_run", f"--out={out}")
+    assert "no 'rainbwo'" in refused(capsys, "--rl=rainbwo", "--dry_run", f"--out={tmp_path}/new")
+    assert sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*")) == before and len(loop.calls) == 1
