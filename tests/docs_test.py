@@ -150,7 +150,7 @@ def test_the_objectives_of_the_tutorial_are_objectives(registry):
     for code in _blocks(ROOT / "docs/tutorial.md", "python"):
         if ".register(" in code:
             exec(compile(code, "tutorial.md", "exec"), {"__name__": "tutorial"})
-    assert list(registry) == ["consistency", "slowness"]
+    assert list(registry) == ["consistency", "continuity"]
     batch, features = 3, 5
     z = jax.random.normal(jax.random.key(0), (4, batch, features))
     latents = Latents(lambda k: z[k], lambda ks: z[jnp.array(ks)])

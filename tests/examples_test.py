@@ -77,19 +77,19 @@ def test_an_own_objective_is_trained_as_it_says_and_its_encoder_is_used_elsewher
     program, name, *arguments = shlex.split(command)
     assert (program, name, arguments.pop()) == ("srl-jax", "train", "--out=runs/slow")
     trained(*arguments, f"--out={path}")
-    assert "slowness:weight=0.01" in Config.load(path).objectives
+    assert "continuity:weight=0.01" in Config.load(path).objectives
     rows = read_metrics(path / "metrics.jsonl")
     last = {kind: [row for row in rows if row["kind"] == kind][-1] for kind in ("train", "eval")}
-    assert last["train"]["loss/slowness"] > 0 and "diag/gradient/slowness/cosine" in last["eval"]
+    assert last["train"]["loss/continuity"] > 0 and "diag/gradient/continuity/cosine" in last["eval"]
     # Its own line imports what the run is made of, and the head learns over an encoder that stays as it is.
     before, after = use_an_encoder.main(str(path), updates=30)
     assert 0 < after < 0.7 * before
 
 
-def test_slowness_is_the_squared_step_of_the_latent_within_an_episode():
+def test_continuity_is_the_squared_step_of_the_latent_within_an_episode():
     window = make_window(batch=3)._replace(valid=np.float32([[1, 1, 1], [0, 0, 0], [1, 0, 0]]))
     z = np.float32([[[0, 0], [1, 1], [2, 0]], [[3, 4], [5, 5], [2, 0]]])  # offsets 0 and 1
-    objective = own_objective.slowness(make_context())
+    objective = own_objective.continuity(make_context())
     latents = Latents(lambda k: z[k], None)
     losses, metrics = objective.loss({}, {}, latents, window, None)
     assert losses.tolist() == [25.0, 0.0, 0.0] and metrics == {}

@@ -14,7 +14,7 @@ from srl_jax import checkpoint, ending
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.ending import Ending
-from srl_jax.types import Context, Decoder, Encoder, TrainState, Window
+from srl_jax.types import Context, Decoder, Encoder, Latents, Objective, TrainState, Window
 from srl_jax.window import to_unit
 
 SIZE, STACK, NUM_ACTIONS = 6, 4, 3
@@ -221,3 +221,23 @@ def write_checkpoint(
     kept = {name: params[name] for name in only or params}
     counts = {"num_actions": NUM_ACTIONS, "env_steps": env_steps, "updates": 1}
     return checkpoint.save(run, kept, config, frame_shape=frame, folder=folder, **counts).path
+
+
+def latents_of(online: np.ndarray, slow: np.ndarray | None = None) -> Latents:
+    """Latents that are known: float32 [K + 1, B, D], the online ones and the slow ones."""
+
+    def give(z):
+        return lambda k: jnp.stack([z[i] for i in k]) if isinstance(k, list) else z[k]
+
+    return Latents(give(jnp.asarray(online)), give(jnp.asarray(online if slow is None else slow)))
+
+
+def draw(*shape: int, seed: int = 0) -> np.ndarray:
+    """Normal numbers, float32."""
+    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
+
+
+def loss_of(objective: Objective, latents: Latents, window: Window, *, seed: int = 0, key: int = 0):
+    """The losses of a head of random numbers, that head, and its slow copy, which is another one."""
+    head, slow = (random_params(objective.init, seed + i) for i in range(2))
+    return np.asarray(objective.loss(head, slow, latents, window, jax.random.key(key))[0]), head, slow

@@ -8,54 +8,31 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import encoders, objectives
+from srl_jax import objectives
 from srl_jax.augment import make_view
-from srl_jax.envs import make
-from srl_jax.modes import MODES
 from srl_jax.objectives.bisimulation import bisimulation_error
-from srl_jax.objectives.forward_pixels import ActionGate
 from srl_jax.objectives.infonce import info_nce
 from srl_jax.objectives.latent_l2 import l2_norm
 from srl_jax.objectives.networks import cosine_distance, over_others, squared_distance
-from srl_jax.objectives.reconstruction import (
-    change_weights,
-    corrupted,
-    shifted_stack,
-    weighted_squared_error,
-)
 from srl_jax.objectives.reward import binary_cross_entropy, symlog, two_hot
 from srl_jax.objectives.slowness import similarity, squared_step
 from srl_jax.objectives.spr import min_max
 from srl_jax.objectives.two_views import covariance_loss, cross_correlation, variance_loss
 from srl_jax.objectives.vae import gaussian_divergence
-from srl_jax.optim import make_optimizer
-from srl_jax.types import Context, Latents, Window
-from srl_jax.update import Hyper, make_init, make_latents, make_update
-from srl_jax.window import image
+from srl_jax.types import Latents, Window
+from srl_jax.update import make_latents
 from tests import helpers
-from tests.helpers import NUM_ACTIONS, STACK, jit, make_context, make_encoder, make_window
+from tests.helpers import (
+    NUM_ACTIONS,
+    draw,
+    latents_of,
+    loss_of,
+    make_context,
+    make_encoder,
+    make_window,
+)
 
 BATCH, D = 4, 5
-
-
-def latents_of(online: np.ndarray, slow: np.ndarray | None = None) -> Latents:
-    """Latents that are known: [K + 1, B, D], the online ones and the slow ones."""
-
-    def give(z):
-        return lambda k: jnp.stack([z[i] for i in k]) if isinstance(k, list) else z[k]
-
-    return Latents(give(jnp.asarray(online)), give(jnp.asarray(online if slow is None else slow)))
-
-
-def draw(*shape: int, seed: int = 0) -> np.ndarray:
-    return np.random.default_rng(seed).normal(size=shape).astype(np.float32)
-
-
-def loss_of(objective, latents, window, *, seed: int = 0, key: int = 0):
-    """The losses of a head of random numbers, and that head."""
-    head, slow = (helpers.random_params(objective.init, seed + i) for i in range(2))
-    return np.asarray(objective.loss(head, slow, latents, window, jax.random.key(key))[0]), head, slow
-
 
 # What they share
 
@@ -363,82 +340,6 @@ def test_latents_are_pulled_to_zero_or_to_the_slow_ones():
     assert objective.slow and not objectives.latent_l2(make_context(D)).slow
 
 
-# Pixels
-
-
-def test_pixels_that_move_weigh_more_by_hand():
-    before, now = np.zeros((2, 2, 1), np.float32), np.zeros((2, 2, 1), np.float32)
-    now[0, 1] = 0.5
-    weights = change_weights(before, now, 3.0)
-    np.testing.assert_array_equal(weights[..., 0], [[1, 4], [1, 1]])
-    # An error of 1 there alone: 4 of 7.
-    error = weighted_squared_error(now, now + (weights > 1), weights)
-    assert float(error) == pytest.approx(4 / 7)
-
-
-def test_a_frame_is_compared_with_the_one_before_it():
-    window = make_window(horizon=1)
-    stack = image(window, 0)
-    before = shifted_stack(stack, window)
-    np.testing.assert_array_equal(before[..., 1:], stack[..., :-1])
-    np.testing.assert_array_equal(before[..., 0], stack[..., 0])
-
-
-def test_corruption_hides_whole_patches_in_all_frames_and_is_seen_by_the_encoder_alone():
-    window = make_window(horizon=1, size=12)
-    window = window._replace(frames=np.full_like(window.frames, 255))
-    frames = np.asarray(corrupted(window, jax.random.key(0), 0.0, 0.5, 4).frames)
-    patches = frames.reshape(*frames.shape[:2], 3, 4, 3, 4)
-    assert np.all(patches.max((3, 5)) == patches.min((3, 5)))
-    assert np.all(frames == frames[:, :1]) and 0.2 < frames.mean() < 0.8
-    noisy = np.asarray(corrupted(window, jax.random.key(0), 0.5, 0.0, 4).frames)
-    assert 0 <= noisy.min() < noisy.max() == 1
-
-    encoder, plain = make_encoder(), make_window(horizon=1)
-    params = helpers.random_params(encoder.init)
-    latents = make_latents(encoder, params, params, plain)
-    for options in ({"noise": 0.3}, {"masked": 0.5, "patch": 2}):
-        objective = objectives.reconstruction(make_context(), **options)
-        losses, head, _ = loss_of(objective, latents, plain)
-        target, output = objective.image(head, latents, plain)  # the picture is of the clean one
-        assert not np.allclose(losses, ((output - target) ** 2).mean((1, 2, 3)), rtol=1e-3)
-
-
-def test_the_gradient_penalty_of_a_linear_decoder_is_its_kernels_size():
-    context, window = make_context(), make_window()
-    plain, penalised = (objectives.reconstruction(context, gradient_penalty=p) for p in (0.0, 2.0))
-    latents = latents_of(draw(1, BATCH, 8))
-    head = helpers.random_params(plain.init)
-    rows = [
-        np.asarray(penalised.loss(head, None, latents, window, jax.random.key(k))[0])
-        - np.asarray(plain.loss(head, None, latents, window, jax.random.key(k))[0])
-        for k in range(30)
-    ]
-    expected = 2.0 * np.sum(np.asarray(head["kernel"]) ** 2) / (6 * 6 * 4)
-    assert np.mean(rows) == pytest.approx(expected, rel=0.15)
-
-
-@pytest.mark.parametrize("action", ["joined", "multiplied"])
-def test_differences_two_steps_ahead(action):
-    objective = objectives.forward_pixels(make_context(), steps=2, target="difference", action=action)
-    window = make_window(horizon=2)
-    window.valid[1, 1] = 0
-    losses, head, _ = loss_of(objective, latents_of(draw(1, BATCH, 8)), window)
-    target, _ = objective.image(head, latents_of(draw(1, BATCH, 8)), window)
-    frames = window.frames.astype(np.float32) / 255
-    stacks = [np.moveaxis(frames[:, k : k + 4, :, :, 0], 1, -1) for k in (0, 2)]
-    np.testing.assert_allclose(target, (1 + stacks[1] - stacks[0]) / 2, atol=1e-6)
-    assert objective.horizon == 2 and losses[1] == 0 and np.all(np.delete(losses, 1) > 0)
-
-
-def test_multiplied_actions_by_hand():
-    gate = ActionGate()
-    eye = {"kernel": np.eye(2), "bias": np.zeros(2)}
-    params = {"latent": eye, "action": {"kernel": np.array([[2.0, 3.0]]), "bias": np.zeros(2)}, "out": eye}
-    output = gate.apply({"params": params}, np.array([[1.0, 10.0]]), np.array([[1.0]]))
-    np.testing.assert_allclose(output, [[2, 30]])
-
-
 @pytest.mark.parametrize(
     ("name", "options", "word"),
     [
@@ -461,70 +362,3 @@ def test_multiplied_actions_by_hand():
 def test_options_out_of_range_are_named(name, options, word):
     with pytest.raises(ValueError, match=word):
         objectives.REGISTRY[name](make_context(), **options)
-
-
-# Collapse
-
-
-@pytest.fixture(scope="module")
-def catch() -> Window:
-    """The first windows of 64 games of Catch under a random policy, of one step."""
-    env = make("Catch", num_envs=64, seed=0, frame_size=42)
-    rng = np.random.default_rng(0)
-    actions = [rng.integers(0, 3, 64) for _ in range(STACK)]
-    frames = [env.reset()[0], *(env.step(a)[0] for a in actions)]
-    env.close()
-    ones = np.ones((64, 1), np.float32)
-    return Window(
-        frames=np.stack(frames, 1).reshape(64, STACK + 1, 42, 42, 1),
-        actions=actions[-1][:, None].astype(np.int32),
-        rewards=0 * ones,
-        discounts=ones,
-        valid=ones,
-        weight=ones[:, 0],
-    )
-
-
-def rank_after_training(
-    name: str, window: Window, updates: int = 100, **options: object
-) -> tuple[float, float]:
-    """The effective rank of the window's latents, their mean among them, before and after training.
-
-    It is 1 where all latents are the same. The head learns 30 times as fast as the encoder, as the theory of
-    self-prediction assumes (Tang et al. 2023, section 3).
-    """
-    encoder = encoders.tiny((42, 42, STACK), features=0)
-    terms = {name: objectives.REGISTRY[name](Context.of(encoder, 3), **options)}
-    optimizer = make_optimizer(terms)
-    init = make_init(encoder, terms, MODES["pretrain"], optimizer)
-    state = jit(init)(jax.random.key(0))
-    update = jit(make_update(encoder, terms, MODES["pretrain"], optimizer))
-    rates = {"encoder": 1e-3, "encoder_srl": 1e-3, "rl": 1e-3, "representation": 3e-2}
-    hyper = Hyper({name: np.float32(1)}, {group: np.float32(rate) for group, rate in rates.items()})
-    encode = jit(encoder.apply)
-
-    def rank() -> float:
-        z = np.asarray(encode(state.params["encoder"], image(window, 0)), np.float64)
-        shares = np.linalg.svd(z, compute_uv=False)
-        shares = shares[shares > 1e-9 * shares[0]] / shares.sum()
-        return float(np.exp(-np.sum(shares * np.log(shares))))
-
-    before = rank()
-    for _ in range(updates):
-        state, _, _ = update(state, window, hyper)
-    return before, rank()
-
-
-def test_self_prediction_collapses_with_neither_slow_target_nor_stop_gradient(catch):
-    ranks = {
-        target: rank_after_training("forward_latent", catch, target=target, hidden=0, distance="cosine")
-        for target in ("gradient", "stopped", "slow")
-    }
-    before, after = ranks["gradient"]
-    assert after < 0.5 * before and after < 0.3 * min(ranks["stopped"][1], ranks["slow"][1]), ranks
-
-
-def test_slowness_collapses_without_variability(catch):
-    before, alone = rank_after_training("slowness", catch, variability=0.0)
-    _, kept = rank_after_training("slowness", catch)
-    assert alone < 0.5 * before and alone < 0.5 * kept, (before, alone, kept)
