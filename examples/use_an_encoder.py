@@ -18,7 +18,7 @@ import numpy as np
 import optax
 
 import srl_jax
-from srl_jax.actor import FrameStack, make_env
+from srl_jax.run.actor import FrameStack, make_env
 from srl_jax.types import Params
 from srl_jax.window import stack_last
 

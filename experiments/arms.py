@@ -18,10 +18,10 @@ from srl_jax import envs
 from srl_jax.config import INFOS
 from srl_jax.data import thesis_curve
 from srl_jax.errors import ConfigError
-from srl_jax.reading import SETTINGS, parse_json, read_bytes
+from srl_jax.files.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text, near
 
-from .flags import MOVED
+from .command_line.flags import MOVED
 from .presets import parts
 
 

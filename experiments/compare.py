@@ -14,15 +14,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from absl import flags
 
-from srl_jax import display, specs, statistics
+from srl_jax import specs, statistics
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.metrics import LEADING
+from srl_jax.files import display
+from srl_jax.files.metrics import LEADING
 
-from . import collect, plots
-from . import flags as config_flags
-from .colours import styles
-from .run_data import RunData
+from .command_line import flags as config_flags
+from .drawing import plots
+from .drawing.colours import styles
+from .runs import collect
+from .runs.run_data import RunData
 
 FLAGS = flags.FLAGS
 LONGEST = 40

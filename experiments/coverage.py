@@ -12,7 +12,7 @@ from absl import flags
 from srl_jax.config import Info
 from srl_jax.statistics import bootstrap, bootstrap_difference, mean, mean_difference, mean_interval
 
-from . import flags as config_flags
+from .command_line import flags as config_flags
 
 RUNS = (2, 3, 5, 7, 10, 20)
 """Of each arm, and of each game."""

@@ -11,8 +11,8 @@ from absl import flags
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 
-from . import flags as config_flags
-from . import plots, run_figures
+from .command_line import flags as config_flags
+from .drawing import plots, run_figures
 
 FLAGS = flags.FLAGS
 

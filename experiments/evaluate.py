@@ -9,12 +9,12 @@ from collections.abc import Callable
 
 from absl import flags
 
-from srl_jax import display
 from srl_jax.errors import ConfigError
+from srl_jax.files import display
 from srl_jax.specs import Info
 
-from . import flags as config_flags
-from . import runtime
+from .command_line import flags as config_flags
+from .command_line import runtime
 
 FLAGS = flags.FLAGS
 
@@ -25,7 +25,7 @@ def check_gif(path: str) -> None:
     Raises:
         ConfigError: it cannot, or there is one already.
     """
-    from . import plots
+    from .drawing import plots
 
     if not plots.available():
         raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
@@ -45,7 +45,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         raise ConfigError("--run: missing; name a run directory or a checkpoint, --run=runs/NAME")
     if FLAGS.gif:
         check_gif(FLAGS.gif)
-    from srl_jax import checkpoint
+    from srl_jax.files import checkpoint
     from srl_jax.modes import MODES
 
     config = checkpoint.read_manifest(FLAGS.run).config
@@ -58,8 +58,9 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
 
     import jax
 
-    from srl_jax import actor, loading
-    from srl_jax.evaluate import evaluate
+    from srl_jax import loading
+    from srl_jax.run import actor
+    from srl_jax.run.evaluate import evaluate
 
     loaded = loading.load(FLAGS.run, imports=FLAGS["import"].value)
     policy, manifest = loaded.policy(jax.random.key(FLAGS.seed)), loaded.manifest
@@ -90,7 +91,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         "lengths": played.lengths,
     }
     if FLAGS.gif:
-        from . import images
+        from .drawing import images
 
         images.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
     display.result(json.dumps(result))

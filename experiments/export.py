@@ -11,8 +11,8 @@ from absl import flags
 
 from srl_jax.errors import ConfigError
 
-from . import flags as config_flags
-from . import runtime
+from .command_line import flags as config_flags
+from .command_line import runtime
 
 FLAGS = flags.FLAGS
 

@@ -18,17 +18,20 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from srl_jax import display, envs, statistics
+from srl_jax import envs, statistics
 from srl_jax.config import Config
 from srl_jax.data import published, reference_policies
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files import display
 from srl_jax.specs import choices_text
 
-from . import collect, packing, plots
-from . import flags as config_flags
+from . import packing
 from .arms import FIGURES, Figure, figures_named
-from .collect import RunData, comparable, steps_and_returns
-from .colours import styles
+from .command_line import flags as config_flags
+from .drawing import plots
+from .drawing.colours import styles
+from .runs import collect
+from .runs.collect import RunData, comparable, steps_and_returns
 from .sweeping import launching, manifest, options, status
 from .sweeping.plan import Arm, Planned, parse_seeds, plan
 

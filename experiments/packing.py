@@ -18,16 +18,17 @@ from typing import Any
 from absl import flags
 
 from srl_jax import config as config_file
-from srl_jax import display, ending
 from srl_jax.config import INFOS, Config
-from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.metrics import parse_row
-from srl_jax.reading import ROWS as MOST_BYTES
-from srl_jax.reading import read_bytes, read_json, replace_bytes, replace_text
+from srl_jax.files import display
+from srl_jax.files.metrics import parse_row
+from srl_jax.files.reading import ROWS as MOST_BYTES
+from srl_jax.files.reading import read_bytes, read_json, replace_bytes, replace_text
+from srl_jax.run import ending
+from srl_jax.run.ending import Ending
 
-from . import flags as config_flags
-from .run_data import RunData, check_rows, in_order, load_run, run_directories, runs_below
+from .command_line import flags as config_flags
+from .runs.run_data import RunData, check_rows, in_order, load_run, run_directories, runs_below
 
 FLAGS = flags.FLAGS
 

@@ -27,12 +27,12 @@ from absl import flags
 from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
-from srl_jax.display import Progress, hms
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files.display import Progress, hms
 from srl_jax.specs import Info, choices_text, value_text
 
-from . import flags as config_flags
-from .stopping import signals
+from .command_line import flags as config_flags
+from .command_line.stopping import signals
 from .train import check_extras
 
 FLAGS = flags.FLAGS
@@ -55,8 +55,8 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
     Raises:
         ConfigError: the policy is no-op, and the game has no such action.
     """
-    from srl_jax.actor import make_env, random_policy, seed_for
-    from srl_jax.evaluate import evaluate
+    from srl_jax.run.actor import make_env, random_policy, seed_for
+    from srl_jax.run.evaluate import evaluate
 
     seed = functools.partial(seed_for, config.seed, "reference policy", policy)
     number = min(episodes, MOST_ENVS)

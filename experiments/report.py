@@ -15,9 +15,9 @@ from pathlib import Path
 from absl import flags
 
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.reading import replace_text
+from srl_jax.files.reading import replace_text
 
-from . import flags as config_flags
+from .command_line import flags as config_flags
 
 FLAGS = flags.FLAGS
 NEEDED = {"jinja2": "Jinja2", "markdown_it": "markdown-it-py", "matplotlib": "matplotlib", "PIL": "Pillow"}

@@ -11,9 +11,10 @@ from pathlib import Path
 
 from srl_jax.errors import ConfigError
 
-from . import flags as config_flags
-from . import help, train
-from .run_data import natural
+from . import train
+from .command_line import flags as config_flags
+from .command_line import help
+from .runs.run_data import natural
 from .sweeping.manifest import FILE
 
 

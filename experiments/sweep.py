@@ -16,11 +16,12 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax import display, envs, rundir
+from srl_jax import envs
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files import display, rundir
 
-from . import collect
-from . import flags as config_flags
+from .command_line import flags as config_flags
+from .runs import collect
 from .sweeping import launching, manifest, options, plan, states, status
 from .sweeping.plan import Planned
 

@@ -15,16 +15,17 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax import display, envs
+from srl_jax import envs
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.resuming import all_to_resume, blank, going_on, is_run, say_anew
-from srl_jax.rundir import check_free, run_directory
+from srl_jax.files import display
+from srl_jax.files.resuming import all_to_resume, blank, going_on, is_run, say_anew
+from srl_jax.files.rundir import check_free, run_directory
 from srl_jax.training import check_game, check_sources, resolved
 
-from . import flags as config_flags
-from . import runtime
-from .stopping import signals
+from .command_line import flags as config_flags
+from .command_line import runtime
+from .command_line.stopping import signals
 
 FLAGS = flags.FLAGS
 
@@ -175,7 +176,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
 
     Raises:
         ConfigError: the command line is not valid; nothing was written.
-        SaveError, Diverged: see `srl_jax.loop.train`.
+        SaveError, Diverged: see `srl_jax.run.loop.train`.
     """
     config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
     if values["print_config"].value:
@@ -196,7 +197,8 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     runtime.check_device()
     config = resolved(config)
 
-    from srl_jax import checkpoint, loop
+    from srl_jax.files import checkpoint
+    from srl_jax.run import loop
 
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
@@ -249,8 +251,8 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
     Raises:
         SaveError: they cannot be written.
     """
-    from . import plots
-    from .run_figures import draw_run
+    from .drawing import plots
+    from .drawing.run_figures import draw_run
 
     if not plots.available():
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")

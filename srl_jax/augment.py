@@ -31,7 +31,7 @@ def random_shift(frames: Array, key: Array, pad: int = 4) -> Array:
     return frames[:, rows][:, :, columns]
 
 
-def intensity(frames: Array, key: Array, scale: float = 0.05) -> jax.Array:
+def intensity(frames: Array, key: Array, scale: float = 0.05) -> Array:
     """Multiplies a sequence of frames by `1 + scale e`, e normal within two deviations.
 
     Schwarzer et al. (2021), appendix; one draw for the whole sequence.

@@ -11,9 +11,10 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from srl_jax import envs, modes, provenance, specs
+from srl_jax import envs, modes, specs
 from srl_jax.errors import ConfigError
-from srl_jax.reading import parse_json, read_json, replace_text
+from srl_jax.files import provenance
+from srl_jax.files.reading import parse_json, read_json, replace_text
 from srl_jax.specs import Info
 
 SOURCES = ("encoder_from", "policy_from")
@@ -167,7 +168,7 @@ class Config:
     loggers: tuple[str, ...] = _value(
         tuple, (),
         "where rows go beside metrics.jsonl: tensorboard, wandb, csv, or module:Logger, a class of your own "
-        "(see srl_jax/loggers.py); may be repeated, or a list with commas; none stands for no logger",
+        "(see srl_jax/files/loggers.py); may be repeated, or a list with commas; none stands for no logger",
         flag="logger",
     )  # fmt: skip
 

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax import checkpoint, plugins
-from srl_jax.actor import Policy
+from srl_jax import plugins
 from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from srl_jax.files import checkpoint
 from srl_jax.optim import ENCODER, RL
+from srl_jax.run.actor import Policy
 from srl_jax.types import Array, Encoder, Params
 from srl_jax.update import epsilon_greedy
 

@@ -4,13 +4,14 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from srl_jax import checkpoint, envs, modes, plugins
+from srl_jax import envs, modes, plugins
 from srl_jax.config import Config, resolve
 from srl_jax.errors import ConfigError
-from srl_jax.rundir import run_directory
+from srl_jax.files import checkpoint
+from srl_jax.files.rundir import run_directory
 
 if TYPE_CHECKING:
-    from srl_jax.loop import Result
+    from srl_jax.run.loop import Result
 
 
 def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True) -> "Result":
@@ -30,7 +31,7 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
 
     Raises:
         ConfigError: the configuration cannot be run, or the directory is not empty; nothing was written.
-        SaveError, Diverged: see `srl_jax.loop.train_seeds`.
+        SaveError, Diverged: see `srl_jax.run.loop.train_seeds`.
     """
     path = Path(out)
     try:
@@ -44,7 +45,7 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
     full = resolved(config)
     check_sources(full)
 
-    from srl_jax import loop
+    from srl_jax.run import loop
 
     with run_directory(path, full):
         return loop.train(full, path, progress=progress)
@@ -75,8 +76,9 @@ def resolved(config: Config) -> Config:
         ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
             these frames, or a logger's package is missing.
     """
-    from srl_jax import encoders, loggers, objectives, rl
+    from srl_jax import encoders, objectives, rl
     from srl_jax.agent import components
+    from srl_jax.files import loggers
 
     if config.imports:
         plugins.load(config.imports)

@@ -1,4 +1,4 @@
-"""srl_jax/actor.py: stacks of frames, seeds, schedules."""
+"""srl_jax/run/actor.py: stacks of frames, seeds, schedules."""
 
 import itertools
 import os
@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax.actor import FrameStack, linear, random_policy, seed_for, yielding_threads
+from srl_jax.run.actor import FrameStack, linear, random_policy, seed_for, yielding_threads
 
 STEP, BEGIN = "step", "begin"
 

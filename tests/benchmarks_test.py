@@ -10,11 +10,11 @@ import types
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
 from experiments.benchmarks import bench, rows
 from experiments.benchmarks.bench import CheckFailed
 from experiments.benchmarks.rows import GROUPS, Row
 from experiments.benchmarks.worker import Worker, WorkerError
+from experiments.command_line import flags as config_flags
 from srl_jax.errors import ConfigError
 from tests.helpers import SMALL
 

@@ -1,4 +1,4 @@
-"""srl_jax/checkpoint.py: what is damaged is refused by name, and nothing that is read is executed."""
+"""srl_jax/files/checkpoint.py: what is damaged is refused by name, and nothing that is read is executed."""
 
 import errno
 import hashlib
@@ -13,9 +13,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax import checkpoint
 from srl_jax.errors import ConfigError
-from srl_jax.reading import read_bytes
+from srl_jax.files import checkpoint
+from srl_jax.files.reading import read_bytes
 from tests.checkpoint_test import flip, make_state, names, whole, write
 
 

@@ -1,4 +1,4 @@
-"""srl_jax/checkpoint.py: what is written comes back bit by bit, or not at all."""
+"""srl_jax/files/checkpoint.py: what is written comes back bit by bit, or not at all."""
 
 import errno
 import hashlib
@@ -11,9 +11,9 @@ import shutil
 import numpy as np
 import pytest
 
-from srl_jax import checkpoint
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files import checkpoint
 from tests.helpers import identical
 
 CONFIG = Config(game="Catch", frame_size=42, encoder="tiny:features=8", seed=5, lr_rl=1 / 3)

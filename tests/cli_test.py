@@ -1,12 +1,12 @@
-"""Tests of the command line: experiments.flags, and what experiments.train refuses."""
+"""Tests of the command line: experiments.command_line.flags, and what experiments.train refuses."""
 
 import importlib
 
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
 from experiments import train
+from experiments.command_line import flags as config_flags
 from experiments.presets import PRESETS
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import EXIT_STATUS, ConfigError, Diverged, SaveError

@@ -1,11 +1,11 @@
-"""Tests of experiments.collect."""
+"""Tests of experiments.runs.collect."""
 
 import pytest
 
-from experiments import collect
+from experiments.runs import collect
 from srl_jax.config import Config
-from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError
+from srl_jax.run.ending import Ending
 from tests.helpers import NOT_FINITE, write_run
 
 

@@ -1,10 +1,10 @@
-"""Tests of experiments.colours."""
+"""Tests of experiments.drawing.colours."""
 
 from hypothesis import given
 from hypothesis import strategies as st
 
 from experiments.arms import FIGURES
-from experiments.colours import COLOURS, styles
+from experiments.drawing.colours import COLOURS, styles
 
 names = st.lists(st.sampled_from([*"abcdefghijk", "joint_256", "rl_only_nature", "joint_50"]), unique=True)
 

@@ -5,9 +5,11 @@ import json
 import pytest
 from absl import flags
 
-from experiments import collect, compare, packing, plots
-from experiments import flags as config_flags
-from experiments.colours import styles
+from experiments import compare, packing
+from experiments.command_line import flags as config_flags
+from experiments.drawing import plots
+from experiments.drawing.colours import styles
+from experiments.runs import collect
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from tests.helpers import NOT_FINITE, write_run

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import strategies as st
 
 from srl_jax import config as config_module
-from srl_jax import modes, provenance
+from srl_jax import modes
 from srl_jax.config import INFOS, Config, difference, resolve
 from srl_jax.errors import ConfigError
+from srl_jax.files import provenance
 from srl_jax.specs import LIMITS
 
 

@@ -29,13 +29,13 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "default"))
 
 @pytest.fixture
 def loop(monkeypatch):
-    """A stub in place of srl_jax.loop, see `tests.in_process.Loop`."""
+    """A stub in place of srl_jax.run.loop, see `tests.in_process.Loop`."""
     import sys
 
     import srl_jax
     from tests.in_process import Loop
 
     stub = Loop()
-    monkeypatch.setitem(sys.modules, "srl_jax.loop", stub)
+    monkeypatch.setitem(sys.modules, "srl_jax.run.loop", stub)
     monkeypatch.setattr(srl_jax, "loop", stub, raising=False)
     return stub

@@ -1,10 +1,10 @@
-"""experiments/control_groups.py: limits of groups in made-up trees of version 1, version 2, and both."""
+"""Limits of control groups, in made-up trees of version 1, version 2, and both."""
 
 import os
 
 import pytest
 
-from experiments import control_groups, runtime
+from experiments.command_line import control_groups, runtime
 from experiments.sweeping import launching
 
 GIB = 2**30

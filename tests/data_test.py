@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.collect import differs
+from experiments.runs.collect import differs
 from srl_jax.config import Config
 from srl_jax.data import (
     Published,

@@ -9,14 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import plots, run_figures
-from srl_jax import checkpoint, envs
+from experiments.drawing import plots, run_figures
+from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout, measures
 from srl_jax.diagnostics.drift import drift_matrix
 from srl_jax.diagnostics.functions import make_conflict, make_functions
 from srl_jax.diagnostics.run import Diagnostics, kept_steps
 from srl_jax.errors import ConfigError
+from srl_jax.files import checkpoint
 from srl_jax.modes import MODES
 from srl_jax.optim import RL
 from srl_jax.replay import Replay

@@ -1,4 +1,4 @@
-"""srl_jax/display.py: a display that is lost ends nothing; what a bar of progress says."""
+"""srl_jax/files/display.py: a display that is lost ends nothing; what a bar of progress says."""
 
 import errno
 import io
@@ -15,12 +15,12 @@ import types
 
 import pytest
 
-from srl_jax import display
 from srl_jax.config import Config
-from srl_jax.display import Display, Progress, hms
 from srl_jax.errors import SaveError
-from srl_jax.metrics import read_metrics
-from srl_jax.reporting import Report
+from srl_jax.files import display
+from srl_jax.files.display import Display, Progress, hms
+from srl_jax.files.metrics import read_metrics
+from srl_jax.run.reporting import Report
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import pytest
 
 from experiments import arms
-from experiments.cli import COMMANDS
+from experiments.command_line.cli import COMMANDS
 from srl_jax import encoders, envs, modes, objectives, rl
 from srl_jax.plugins import Registry
 from srl_jax.types import Context, Latents, Window
@@ -27,7 +27,7 @@ COMMAND = re.compile(r"(?:srun )?(python -m experiments\.\S+|srl-jax )")
 PARSE = """
 import copy, json, runpy, sys
 from absl import flags
-from experiments import flags as config_flags
+from experiments.command_line import flags as config_flags
 
 module, commands = sys.argv[1:]
 

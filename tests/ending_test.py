@@ -1,10 +1,10 @@
-"""srl_jax/ending.py: what ended.json says, and that nothing else is taken for it."""
+"""srl_jax/run/ending.py: what ended.json says, and that nothing else is taken for it."""
 
 import pytest
 
-from srl_jax import ending
-from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.run import ending
+from srl_jax.run.ending import Ending
 
 
 def test_it_is_read_as_it_was_written_and_goes(tmp_path):

@@ -1,11 +1,11 @@
-"""srl_jax/evaluate.py on games whose whole course is written down."""
+"""srl_jax/run/evaluate.py on games whose whole course is written down."""
 
 import numpy as np
 import pytest
 from gymnasium.spaces import Box
 
 from srl_jax import envs
-from srl_jax.evaluate import evaluate
+from srl_jax.run.evaluate import evaluate
 
 
 class Scripted:

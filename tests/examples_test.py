@@ -13,12 +13,12 @@ from gymnasium.utils.env_checker import check_env
 
 from examples import foreign_loop, own_objective, use_an_encoder
 from examples.own_environment import Dot
-from experiments import flags as config_flags
 from experiments import train
+from experiments.command_line import flags as config_flags
 from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout, run
-from srl_jax.metrics import read_metrics
+from srl_jax.files.metrics import read_metrics
 from srl_jax.types import Latents
 from tests.helpers import make_context, make_window
 

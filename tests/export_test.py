@@ -12,7 +12,7 @@ from absl import flags
 
 import srl_jax
 from experiments import export
-from experiments import flags as config_flags
+from experiments.command_line import flags as config_flags
 from srl_jax import encoders, specs
 from srl_jax.errors import ConfigError, SaveError
 from tests.helpers import JOINT, fill, identical, write_checkpoint

@@ -6,10 +6,12 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import collect, figures, plots
-from experiments import flags as config_flags
+from experiments import figures
 from experiments.arms import FIGURES, Figure, FigureArm
+from experiments.command_line import flags as config_flags
+from experiments.drawing import plots
 from experiments.reporting.numbers import arms_of, compare, table
+from experiments.runs import collect
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
@@ -191,7 +193,7 @@ def test_the_same_runs_give_the_same_bytes(runs, tmp_path):
 
 def test_an_arm_has_one_colour_in_all_figures_of_a_directory_and_on_its_page(runs):
     pytest.importorskip("matplotlib")
-    from experiments.colours import styles
+    from experiments.drawing.colours import styles
 
     other = Figure("other", "Other", "?", (FigureArm("b", "catch/joint"), FigureArm("c", "catch/joint")))
     (runs / "Catch/other").rename(runs / "Catch/c")

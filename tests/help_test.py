@@ -1,4 +1,4 @@
-"""experiments/help.py: what --help prints."""
+"""experiments/command_line/help.py: what --help prints."""
 
 import importlib
 import subprocess
@@ -7,9 +7,10 @@ import sys
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import help, sweep, train
-from experiments.cli import COMMANDS
+from experiments import sweep, train
+from experiments.command_line import flags as config_flags
+from experiments.command_line import help
+from experiments.command_line.cli import COMMANDS
 from experiments.presets import PIECES, PIECES_HELP, PRESETS
 from srl_jax import encoders, objectives, rl
 from srl_jax.config import INFOS

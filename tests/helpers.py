@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax import checkpoint, ending
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
-from srl_jax.ending import Ending
+from srl_jax.files import checkpoint
+from srl_jax.run import ending
+from srl_jax.run.ending import Ending
 from srl_jax.types import Context, Decoder, Encoder, Latents, Objective, TrainState, Window
 from srl_jax.window import to_unit
 
@@ -171,8 +172,8 @@ def zero_leaves(tree) -> list[str]:
 
 
 def one_run(config: Config, path: Path | None = None, **options):
-    """A `srl_jax.loop.Run` of one seed."""
-    from srl_jax.loop import Run
+    """A `srl_jax.run.loop.Run` of one seed."""
+    from srl_jax.run.loop import Run
 
     return Run([config], [path or Path()], **options)
 

@@ -1,9 +1,9 @@
-"""Tests of experiments.images."""
+"""Tests of experiments.drawing.images."""
 
 import numpy as np
 import pytest
 
-from experiments import images, plots
+from experiments.drawing import images, plots
 
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")

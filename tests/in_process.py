@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
 from experiments import train
-from srl_jax import checkpoint
+from experiments.command_line import flags as config_flags
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from srl_jax.files import checkpoint
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 CATCH = ["--game=Catch", "--encoder=tiny", "--frame_size=42", "--steps=500", "--checkpoint_every=100"]
@@ -22,10 +22,10 @@ CATCH += ["--nodiagnostics"]
 
 
 class Loop(types.ModuleType):
-    """Stands in for srl_jax.loop."""
+    """Stands in for srl_jax.run.loop."""
 
     def __init__(self):
-        super().__init__("srl_jax.loop")
+        super().__init__("srl_jax.run.loop")
         self.calls = []
         self.resumed = []
         self.seeds = []

@@ -8,9 +8,9 @@ three minutes, is a campaign and lies in experiments/results.
 import pytest
 
 from experiments.presets import preset_values
-from srl_jax import loop
 from srl_jax.config import Config
-from srl_jax.metrics import read_metrics
+from srl_jax.files.metrics import read_metrics
+from srl_jax.run import loop
 
 SHORT = {"steps": 24_000, "eval_every": 24_000, "eval_games": 200, "eps_anneal_steps": 8_000}
 

@@ -1,4 +1,4 @@
-"""srl_jax/loggers.py: who is given a run's rows, each of them once, and what happens where one fails."""
+"""Loggers: who is given a run's rows, each of them once, and what happens where one fails."""
 
 import csv
 import io
@@ -9,12 +9,12 @@ import types
 import numpy as np
 import pytest
 
-from srl_jax import loggers
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.loggers import check, factory, listed
-from srl_jax.metrics import read_metrics
-from srl_jax.reporting import Report
+from srl_jax.files import loggers
+from srl_jax.files.loggers import check, factory, listed
+from srl_jax.files.metrics import read_metrics
+from srl_jax.run.reporting import Report
 from tests.helpers import SMALL
 
 MINE = """

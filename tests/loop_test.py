@@ -16,19 +16,21 @@ from absl import flags
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
-from experiments import flags as config_flags
-from srl_jax import actor, checkpoint, ending, loading, loop, seed, training
+from experiments.command_line import flags as config_flags
+from srl_jax import loading, training
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
 from srl_jax.diagnostics.pictures import PICTURES
 from srl_jax.envs.catch import Catch
 from srl_jax.errors import ConfigError, Diverged, SaveError
-from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.files import checkpoint
+from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.modes import ENCODER_OPTIMIZERS
 from srl_jax.replay import Replay
-from srl_jax.reporting import Report
-from srl_jax.schedules import Schedules
+from srl_jax.run import actor, ending, loop, seed
+from srl_jax.run.reporting import Report
+from srl_jax.run.schedules import Schedules
 from srl_jax.types import Window
 from srl_jax.update import Hyper
 from tests.helpers import JOINT, SMALL, identical, one_run

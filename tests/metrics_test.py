@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax.metrics import Mark, MetricsWriter, read_metrics, strip_wall
+from srl_jax.files.metrics import Mark, MetricsWriter, read_metrics, strip_wall
 
 
 def lines(path):

@@ -12,7 +12,7 @@ import zipfile
 import pytest
 
 import srl_jax
-from experiments import cli
+from experiments.command_line import cli
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

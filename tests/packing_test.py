@@ -6,10 +6,11 @@ import json
 import pytest
 from absl import flags
 
-from experiments import collect, figures, packing, report
-from experiments import flags as config_flags
-from srl_jax.ending import Ending
+from experiments import figures, packing, report
+from experiments.command_line import flags as config_flags
+from experiments.runs import collect
 from srl_jax.errors import ConfigError
+from srl_jax.run.ending import Ending
 from tests.helpers import NOT_FINITE, write_run
 
 ROW = {

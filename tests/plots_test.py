@@ -1,4 +1,4 @@
-"""Tests of experiments.plots."""
+"""Tests of experiments.drawing.plots."""
 
 import subprocess
 import sys
@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("matplotlib")
 
-from experiments import plots  # noqa: E402
+from experiments.drawing import plots  # noqa: E402
 from srl_jax.data import thesis_curve  # noqa: E402
 
 STEPS = [0, 100, 200]
@@ -112,7 +112,7 @@ def test_policies_that_learn_nothing_are_lines_and_near_ones_share_one(drawn, tm
 
 def test_available_without_importing_and_without_the_extra(monkeypatch):
     code = (
-        "import sys; from experiments import plots; assert plots.available();"
+        "import sys; from experiments.drawing import plots; assert plots.available();"
         "assert not {'matplotlib', 'PIL'} & set(sys.modules)"
     )
     subprocess.run([sys.executable, "-c", code], check=True)

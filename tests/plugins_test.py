@@ -12,12 +12,12 @@ import pytest
 from absl import flags
 
 from experiments import evaluate, train
-from experiments import flags as config_flags
+from experiments.command_line import flags as config_flags
 from srl_jax import objectives, plugins
-from srl_jax.checkpoint import read_manifest
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.metrics import read_metrics
+from srl_jax.files.checkpoint import read_manifest
+from srl_jax.files.metrics import read_metrics
 from srl_jax.plugins import Registry, load, located
 from srl_jax.specs import parse
 from tests.helpers import SMALL, write_run

@@ -1,11 +1,11 @@
-"""Tests of srl_jax.reading."""
+"""Tests of srl_jax.files.reading."""
 
 import math
 import os
 
 import pytest
 
-from srl_jax.reading import parse_json, read_bytes
+from srl_jax.files.reading import parse_json, read_bytes
 
 
 def test_a_file_is_read_up_to_its_limit(tmp_path):

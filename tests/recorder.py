@@ -9,10 +9,10 @@ import numpy as np
 
 import srl_jax
 from srl_jax import envs
-from srl_jax.actor import FrameStack
 from srl_jax.config import Config
 from srl_jax.envs.atari import COUNTERS
 from srl_jax.replay import Replay
+from srl_jax.run.actor import FrameStack
 from srl_jax.types import Window
 
 Count = Counter[str]

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
 from experiments import reference_policies as played
-from experiments.collect import differs
+from experiments.command_line import flags as config_flags
+from experiments.runs.collect import differs
 from srl_jax.config import Config
 from srl_jax.data import POLICIES, published, reference_policies
 from srl_jax.envs import ATARI_57

@@ -1,7 +1,7 @@
 """What a replay should hold, as lists of whole episodes; and a driver that compares the two.
 
-The reference shares no code with srl_jax/replay.py: it keeps every observation for ever and looks everything
-up slowly. Nothing here is an `assert`, so that `python -O` checks as much.
+The reference shares no code with srl_jax/replay/__init__.py: it keeps every observation for ever and looks
+everything up slowly. Nothing here is an `assert`, so that `python -O` checks as much.
 """
 
 import itertools

@@ -1,4 +1,4 @@
-"""srl_jax/replay.py against lists of whole episodes, and numbers worked by hand."""
+"""srl_jax/replay/__init__.py against lists of whole episodes, and numbers worked by hand."""
 
 import json
 

@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import collect, images, plots, report
-from experiments import flags as config_flags
-from experiments.collect import RunData
-from srl_jax import ending
+from experiments import report
+from experiments.command_line import flags as config_flags
+from experiments.drawing import images, plots
+from experiments.runs import collect
+from experiments.runs.collect import RunData
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
+from srl_jax.run import ending
 from tests.helpers import NOT_FINITE
 
 Image = pytest.importorskip("PIL.Image", reason="needs the extra plots")

@@ -1,4 +1,4 @@
-"""srl_jax/reporting.py: means of updates, and rows that go on as if nobody had stopped."""
+"""srl_jax/run/reporting.py: means of updates, and rows that go on as if nobody had stopped."""
 
 import json
 
@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax import reporting
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.optim import NOT_MEASURED
-from srl_jax.reporting import Means, Report
+from srl_jax.run import reporting
+from srl_jax.run.reporting import Means, Report
 
 
 def one_by_one(rows, name):

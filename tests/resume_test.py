@@ -12,12 +12,14 @@ import numpy as np
 import pytest
 from flax import serialization
 
-from srl_jax import checkpoint, envs, loop, replay, seed
-from srl_jax.actor import seed_for
+from srl_jax import envs, replay
 from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.files import checkpoint
+from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.run import loop, seed
+from srl_jax.run.actor import seed_for
 from tests.helpers import SMALL, identical, jit, one_run
 from tests.rundir_test import contents
 

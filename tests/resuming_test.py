@@ -1,4 +1,4 @@
-"""srl_jax/resuming.py: where a run goes on; --out of experiments.train, and how runs are found on disk."""
+"""Where a run goes on, --out of experiments.train, and how runs are found on disk: srl_jax.files.resuming."""
 
 import contextlib
 import dataclasses
@@ -9,13 +9,14 @@ import shutil
 import numpy as np
 import pytest
 
-from experiments import run_data
+from experiments.runs import run_data
 from experiments.train import check_out
-from srl_jax import checkpoint, ending, provenance
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.resuming import all_to_resume, going_on, to_resume
-from srl_jax.rundir import run_directory
+from srl_jax.files import checkpoint, provenance
+from srl_jax.files.resuming import all_to_resume, going_on, to_resume
+from srl_jax.files.rundir import run_directory
+from srl_jax.run import ending
 from tests.helpers import NOT_FINITE, write_run
 from tests.rundir_test import contents
 

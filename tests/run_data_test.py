@@ -1,11 +1,11 @@
-"""Tests of experiments.run_data: what is drawn is checked first."""
+"""Tests of experiments.runs.run_data: what is drawn is checked first."""
 
 import json
 import os
 
 import pytest
 
-from experiments import run_data
+from experiments.runs import run_data
 from srl_jax.specs import ConfigError
 
 EVAL = {"kind": "eval", "env_steps": 5, "eval/return_mean": 1.0, "eval/returns": [1.0, None]}

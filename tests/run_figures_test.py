@@ -1,11 +1,11 @@
-"""Tests of experiments.run_figures."""
+"""Tests of experiments.drawing.run_figures."""
 
 import json
 
 import numpy as np
 import pytest
 
-from experiments import plots, run_figures
+from experiments.drawing import plots, run_figures
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 

@@ -1,4 +1,4 @@
-"""srl_jax/rundir.py: one writer at a time, whatever becomes of it."""
+"""srl_jax/files/rundir.py: one writer at a time, whatever becomes of it."""
 
 import errno
 import fcntl
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-from srl_jax import rundir
 from srl_jax.errors import ConfigError
+from srl_jax.files import rundir
 
 ROOT = Path(__file__).resolve().parents[1]
 HOLD = """

@@ -1,4 +1,4 @@
-"""Tests of experiments.runtime. None writes to the user's cache, and only the last one restarts anything."""
+"""Tests of runtime. None writes to the cache of the user, and only the last one restarts anything."""
 
 import importlib.metadata
 import os
@@ -9,9 +9,10 @@ import sys
 import pytest
 from absl import flags
 
-from experiments import evaluate, runtime, train
-from experiments import flags as config_flags
-from srl_jax.metrics import read_metrics, strip_wall
+from experiments import evaluate, train
+from experiments.command_line import flags as config_flags
+from experiments.command_line import runtime
+from srl_jax.files.metrics import read_metrics, strip_wall
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 CACHE = pathlib.Path("/cache/xla")

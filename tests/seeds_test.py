@@ -5,11 +5,12 @@ import itertools
 import numpy as np
 import pytest
 
-from srl_jax import checkpoint, ending, loop
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged
-from srl_jax.loop import train_seeds
-from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.files import checkpoint
+from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.run import ending, loop
+from srl_jax.run.loop import train_seeds
 
 CONFIG = dict(
     game="Catch", mode="joint", frame_size=42, encoder="tiny:features=8", objectives=("inverse",), num_envs=2,

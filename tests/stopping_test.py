@@ -1,4 +1,4 @@
-"""experiments/stopping.py: which signals end a program, and which are left alone."""
+"""experiments/command_line/stopping.py: which signals end a program, and which are left alone."""
 
 import os
 import signal
@@ -9,7 +9,7 @@ from signal import SIGHUP, SIGINT, SIGTERM, SIGUSR1
 
 import pytest
 
-from experiments.stopping import ASKING, WARNING, signals
+from experiments.command_line.stopping import ASKING, WARNING, signals
 
 
 @pytest.fixture(autouse=True)
@@ -64,7 +64,7 @@ def test_signals_that_have_another_use_keep_it():
 def test_a_program_under_nohup_does_not_hear_its_terminal_close(tmp_path):
     code = (
         "import os, signal\n"
-        "from experiments.stopping import signals\n"
+        "from experiments.command_line.stopping import signals\n"
         "with signals() as found:\n"
         "    os.kill(os.getpid(), signal.SIGHUP)\n"
         "    print(found)"

@@ -1,11 +1,11 @@
-"""srl_jax/sumtree.py against numpy's cumsum."""
+"""srl_jax/replay/sumtree.py against numpy's cumsum."""
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from srl_jax.sumtree import SumTree
+from srl_jax.replay.sumtree import SumTree
 
 
 def find(tree, prefix_sums):

@@ -17,15 +17,17 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
-from experiments import runtime, sweep
+from experiments import sweep
+from experiments.command_line import flags as config_flags
+from experiments.command_line import runtime
 from experiments.sweeping import launching, manifest, options, states, status
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
-from srl_jax import checkpoint, ending, rundir
 from srl_jax.config import Config
-from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files import checkpoint, rundir
+from srl_jax.run import ending
+from srl_jax.run.ending import Ending
 
 STUB = pathlib.Path(__file__).with_name("stub_run.py")
 CONFIG = Config(game="Catch", frame_size=42, steps=500, checkpoint_every=100, num_envs=4, learn_start=40)

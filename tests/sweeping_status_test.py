@@ -3,14 +3,16 @@
 import dataclasses
 import json
 
-from experiments import collect, packing
+from experiments import packing
+from experiments.runs import collect
 from experiments.sweeping import status
 from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
 from experiments.sweeping.status import Progress, rates, seconds_left
-from srl_jax import ending, rundir
 from srl_jax.config import Config
-from srl_jax.ending import Ending
+from srl_jax.files import rundir
+from srl_jax.run import ending
+from srl_jax.run.ending import Ending
 from tests.helpers import NOT_FINITE, write_run
 
 CONFIG = Config(game="Catch", frame_size=42, steps=1000, learn_start=10)

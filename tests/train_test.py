@@ -12,10 +12,10 @@ import types
 import pytest
 
 from experiments import resume, train
-from srl_jax import checkpoint, rundir
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.files import checkpoint, rundir
+from srl_jax.files.metrics import read_metrics, strip_wall
 from tests.helpers import SMALL
 from tests.in_process import CATCH, ROOT, checkpoint_of, refused, train_in_process
 
@@ -287,7 +287,7 @@ RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=
 
 
 def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys, monkeypatch):
-    from srl_jax import loop
+    from srl_jax.run import loop
 
     out, command = tmp_path / "run", [sys.executable, "-m", "experiments.train", *RUN]
     first = subprocess.Popen(

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import srl_jax
-from srl_jax import ending
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.metrics import read_metrics
+from srl_jax.files.metrics import read_metrics
+from srl_jax.run import ending
 from srl_jax.training import check_sources, resolved
 from tests.checkpoint_test import CONFIG, write
 from tests.helpers import SMALL

@@ -24,13 +24,13 @@ from typing import Any
 import numpy as np
 from absl import flags
 
-from srl_jax import display
 from srl_jax.errors import ConfigError
-from srl_jax.provenance import git_revision, versions
+from srl_jax.files import display
+from srl_jax.files.provenance import git_revision, versions
 from srl_jax.specs import Info, choices_text
 
-from .. import flags as config_flags
-from .. import runtime
+from ..command_line import flags as config_flags
+from ..command_line import runtime
 from .rows import GROUPS, Group
 from .worker import ROOT, Worker, WorkerError
 

@@ -13,10 +13,10 @@ from typing import Any
 from absl import flags
 
 from srl_jax.errors import ConfigError
-from srl_jax.provenance import versions
+from srl_jax.files.provenance import versions
 from srl_jax.specs import Info
 
-from .. import flags as config_flags
+from ..command_line import flags as config_flags
 from .bench import check_out
 from .rows import JOINT, NATURE, number, spread, spread_text
 
@@ -36,7 +36,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
 
 def whole_run(seconds: float) -> dict[str, float]:
     """Projects a whole run of Pong, 5M env steps, from a stretch of the loop and one evaluation."""
-    from srl_jax.loop import Run
+    from srl_jax.run.loop import Run
 
     from .jax_side import config_of
 

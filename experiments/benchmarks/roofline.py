@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from .. import runtime
+from ..command_line import runtime
 from .host_side import timed
 from .rows import JOINT, NATURE
 

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .. import runtime
+from ..command_line import runtime
 
 
 class Program(NamedTuple):

@@ -11,8 +11,9 @@ import sys
 import tempfile
 import time
 
-from .. import flags as config_flags
-from .. import runtime, train
+from .. import train
+from ..command_line import flags as config_flags
+from ..command_line import runtime
 from .worker import ROOT
 
 
@@ -69,7 +70,7 @@ class Memory:
 def prepare(tune: str, encoder: str) -> None:
     """As `runtime.prepare`; the run that follows ends after its first update."""
     runtime.prepare(tune, encoder)
-    from srl_jax.loop import Run
+    from srl_jax.run.loop import Run
 
     update = Run.update
 

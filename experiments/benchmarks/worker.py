@@ -79,7 +79,8 @@ def main(side: str, arguments: Mapping[str, Any]) -> None:
     """
     module, _, name = side.rpartition(".")
     if module in TUNED:
-        from .. import presets, runtime
+        from .. import presets
+        from ..command_line import runtime
 
         runtime.prepare("auto", presets.PRESETS[arguments["preset"]]["encoder"])
     built = None

@@ -9,11 +9,11 @@ from typing import Any
 from srl_jax import envs, specs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
+from srl_jax.files.provenance import history
 from srl_jax.modes import MODES
-from srl_jax.provenance import history
 
-from .. import collect
-from ..collect import RunData
+from ..runs import collect
+from ..runs.collect import RunData
 
 THEN = ", then "
 """Between what a run was made by and what it was resumed under."""

@@ -14,12 +14,12 @@ import numpy as np
 from srl_jax import statistics
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
-from srl_jax.reading import parse_json
+from srl_jax.files.reading import parse_json
 
-from .. import plots, run_figures
-from ..collect import RunData
-from ..colours import Style
-from ..run_data import natural
+from ..drawing import plots, run_figures
+from ..drawing.colours import Style
+from ..runs.collect import RunData
+from ..runs.run_data import natural
 from . import numbers, pictures, readme
 from .pictures import Curve, Picture
 

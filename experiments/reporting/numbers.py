@@ -13,10 +13,10 @@ from srl_jax.errors import ConfigError
 from srl_jax.specs import LIMITS
 from srl_jax.statistics import NARROW, Interval
 
-from .. import collect
-from ..collect import RunData, has_policy
 from ..presets import PRESETS
-from ..run_data import natural
+from ..runs import collect
+from ..runs.collect import RunData, has_policy
+from ..runs.run_data import natural
 
 NEVER = 1e18
 """Env steps that stand for never, where a median is drawn again."""

@@ -15,9 +15,9 @@ from srl_jax.data import POLICIES, published, reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.statistics import Interval
 
-from .. import collect
-from ..collect import RunData
-from ..colours import styles
+from ..drawing.colours import styles
+from ..runs import collect
+from ..runs.collect import RunData
 from . import configs, gallery, numbers, readme
 
 SECTIONS = {

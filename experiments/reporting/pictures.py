@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 from srl_jax import statistics
 from srl_jax.errors import ConfigError
-from srl_jax.reading import read_bytes
+from srl_jax.files.reading import read_bytes
 
-from .. import plots
-from ..colours import Style
-from ..plots import Curve
+from ..drawing import plots
+from ..drawing.colours import Style
+from ..drawing.plots import Curve
 
 heights, interval_curves = plots.heights, plots.interval_curve
 LARGEST = 1 << 24

@@ -8,7 +8,7 @@ from markdown_it.token import Token
 from markupsafe import Markup
 
 from srl_jax.errors import ConfigError
-from srl_jax.reading import SETTINGS, read_bytes
+from srl_jax.files.reading import SETTINGS, read_bytes
 
 from . import pictures
 

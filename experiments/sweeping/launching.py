@@ -20,12 +20,13 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import srl_jax
-from srl_jax import display, envs, rundir
+from srl_jax import envs
 from srl_jax.config import Config
 from srl_jax.errors import EXIT_STATUS, ConfigError, Diverged, SaveError, saving
+from srl_jax.files import display, rundir
 
-from .. import control_groups, runtime
-from ..stopping import signals
+from ..command_line import control_groups, runtime
+from ..command_line.stopping import signals
 from . import manifest, plan, states, status
 from .manifest import Entry
 

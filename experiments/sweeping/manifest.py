@@ -11,9 +11,9 @@ from absl import flags
 
 from srl_jax.config import Config, difference
 from srl_jax.errors import ConfigError, saving
-from srl_jax.reading import parse_json, read_bytes, replace_text
+from srl_jax.files.reading import parse_json, read_bytes, replace_text
 
-from .. import flags as config_flags
+from ..command_line import flags as config_flags
 from .plan import Planned, settings
 
 FILE = "sweep.json"
@@ -122,7 +122,7 @@ def parsed(run: Planned) -> Config:
 
 
 def _check_sources(entry: Entry, entries: Mapping[str, Entry]) -> None:
-    """`srl_jax.checkpoint.check_sources` before there are any checkpoints.
+    """`srl_jax.files.checkpoint.check_sources` before there are any checkpoints.
 
     Raises:
         ConfigError: the run cannot start from those that it names.

@@ -5,12 +5,12 @@ from typing import Any
 
 from absl import flags
 
-from srl_jax import display
 from srl_jax.config import INFOS
 from srl_jax.errors import ConfigError
+from srl_jax.files import display
 from srl_jax.specs import Info, value_text
 
-from .. import flags as config_flags
+from ..command_line import flags as config_flags
 from ..presets import preset_values
 from . import plan
 

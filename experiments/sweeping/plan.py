@@ -8,13 +8,14 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from srl_jax import envs, loggers, plugins
+from srl_jax import envs, plugins
 from srl_jax.config import INFOS
 from srl_jax.errors import ConfigError
+from srl_jax.files import loggers
 from srl_jax.specs import choices_text
 
 from .. import PACKAGE
-from ..flags import unknown
+from ..command_line.flags import unknown
 from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, parts, preset_values, source_preset
 
 Flags = Mapping[str, str | tuple[str, ...]]

@@ -11,10 +11,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax import checkpoint, ending, resuming, rundir
-from srl_jax.checkpoint import NUMBERS, PARAMS
 from srl_jax.config import INFOS, Config, another_run, difference
 from srl_jax.errors import ConfigError, saving
+from srl_jax.files import checkpoint, resuming, rundir
+from srl_jax.files.checkpoint import NUMBERS, PARAMS
+from srl_jax.run import ending
 
 from .manifest import Entry
 

@@ -11,13 +11,15 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax import checkpoint, envs, statistics
+from srl_jax import envs, statistics
 from srl_jax.config import Config
-from srl_jax.display import hms
 from srl_jax.errors import ConfigError
+from srl_jax.files import checkpoint
+from srl_jax.files.display import hms
 
-from .. import collect, packing
-from ..collect import RunData
+from .. import packing
+from ..runs import collect
+from ..runs.collect import RunData
 from . import states
 from .manifest import Entry
 

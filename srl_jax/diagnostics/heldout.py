@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from srl_jax import envs
-from srl_jax.actor import seed_for
 from srl_jax.config import Config
 from srl_jax.replay import Replay
+from srl_jax.run.actor import seed_for
 from srl_jax.types import Window
 
 SEED = 0

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax import checkpoint
-from srl_jax.actor import seed_for
 from srl_jax.config import Config
 from srl_jax.diagnostics import measures
 from srl_jax.diagnostics.functions import Functions
 from srl_jax.diagnostics.heldout import HeldOut, collect
 from srl_jax.errors import ConfigError
+from srl_jax.files import checkpoint
 from srl_jax.replay import Replay
+from srl_jax.run.actor import seed_for
 from srl_jax.types import Params, TrainState, Window
 from srl_jax.update import Hyper
 

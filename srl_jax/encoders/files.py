@@ -11,8 +11,9 @@ import numpy as np
 from flax.serialization import to_state_dict
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from srl_jax import checkpoint, encoders, specs
+from srl_jax import encoders, specs
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files import checkpoint
 from srl_jax.types import Encoder, Params
 
 ABOUT = "about"

@@ -2,6 +2,7 @@
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 
 from srl_jax.objectives.networks import DISTANCES, MLP, functions, join, one_hot
 from srl_jax.specs import check_choice, check_size
@@ -70,7 +71,8 @@ def forward_latent(
         targets = latents.slow(ahead) if target == "slow" else latents.online(ahead)
         if target == "stopped":
             targets = jax.lax.stop_gradient(targets)
-        z, losses = latents.online(0), 0.0
+        z = latents.online(0)
+        losses: Array = jnp.zeros(len(z))
         for k in range(steps):
             z = apply(head, z, one_hot(window.actions[:, k], context.num_actions))
             losses += window.valid[:, k] * between(z, targets[k])

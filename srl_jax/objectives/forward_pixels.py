@@ -1,5 +1,7 @@
 """Forward prediction in pixel space: a later observation from the latent and the actions until then."""
 
+from typing import Any
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -22,7 +24,7 @@ class ActionGate(nn.Module):
     """
 
     @nn.compact
-    def __call__(self, z: Array, actions: Array) -> Array:
+    def __call__(self, z: Any, actions: Any) -> Array:
         size = z.shape[-1]
         inner = Dense(size, name="latent")(z) * Dense(size, name="action")(actions)
         return Dense(size, name="out")(inner)

@@ -1,6 +1,7 @@
 """Small networks that several objectives have above the latent."""
 
 from collections.abc import Callable
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -24,7 +25,7 @@ class MLP(nn.Module):
     layer_norm: bool = False
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, x: Any) -> Array:
         if self.hidden:
             x = Dense(self.hidden, name="hidden")(x)
             if self.layer_norm:
@@ -85,7 +86,7 @@ def masked_mean(values: Array, mask: Array, axis: int | None = None) -> jax.Arra
     return jnp.sum(values * mask, axis) / jnp.maximum(jnp.sum(mask, axis), 1.0)
 
 
-def over_others(function: Callable, valid: Array, *arrays: Array) -> jax.Array:
+def over_others(function: Callable, valid: Array, *arrays: Array) -> Array:
     """The mean of `function(x_i..., x_j...)` over the valid rows j other than i: float32 [B].
 
     Rows that are not valid give 0.

@@ -13,7 +13,7 @@ from srl_jax.update import ema
 TARGETS = ("slow", "stopped")
 
 
-def min_max(z: Array) -> jax.Array:
+def min_max(z: Array) -> Array:
     """One latent moved and scaled into [0, 1], a constant to 0: float32 [D] -> float32 [D] (SPR's code)."""
     low = jnp.min(z)
     return (z - low) / jnp.maximum(jnp.max(z) - low, 1e-5)
@@ -94,7 +94,8 @@ def spr(
         ahead = [k + 1 for k in range(steps)]
         behind = (latents.slow(ahead), slow_head) if target == "slow" else (latents.online(ahead), head)
         targets, below = jax.lax.stop_gradient(behind)
-        z, losses = jax.vmap(min_max)(latents.online(0)), 0.0
+        z: Array = jax.vmap(min_max)(latents.online(0))
+        losses: Array = jnp.zeros(len(z))
         for k in range(steps):
             z = transition(head["transition"], z, one_hot(window.actions[:, k], context.num_actions))
             prediction = predict(head["predictor"], project(head["projection"], z))

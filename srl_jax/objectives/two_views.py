@@ -112,7 +112,7 @@ def vicreg(
     return Objective(init, loss, weight)
 
 
-def cross_correlation(z: Array, other: Array) -> jax.Array:
+def cross_correlation(z: Array, other: Array) -> Array:
     """Pearson's correlation over the batch of each pair of features: [B, D], [B, D] -> float32 [D, D]."""
     z, other = ((x - jnp.mean(x, 0)) / jnp.sqrt(jnp.var(x, 0) + 1e-5) for x in (z, other))
     return z.T @ other / len(z)

@@ -12,8 +12,8 @@ import pytest
 from absl import flags
 
 from experiments import draw, evaluate, train
-from experiments import flags as config_flags
-from experiments.flags import last_of_each
+from experiments.command_line import flags as config_flags
+from experiments.command_line.flags import last_of_each
 from tests.helpers import SMALL, write_checkpoint, write_run
 
 LIMIT_S = 20

@@ -8,7 +8,7 @@ import socket
 
 import pytest
 
-from srl_jax import checkpoint
+from srl_jax.files import checkpoint
 from tests.malformed.conftest import CODE, DRAW, EVALUATE, GIVEN, OVERWRITE, START, TRAIN, call
 
 DEEP = 100_000

@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from experiments import train
-from experiments.flags import MOVED, fail
+from experiments.command_line.flags import MOVED, fail
 from srl_jax.config import INFOS
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info

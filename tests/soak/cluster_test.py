@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from srl_jax import ending
+from srl_jax.run import ending
 from tests.soak.conftest import ROOT
 from tests.soak.sweeps_test import SMALL, check_runs, command, descendants, left_alone, parent, runs_of
 

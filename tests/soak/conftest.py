@@ -14,11 +14,11 @@ from unittest import mock
 import pytest
 from absl import flags
 
-from experiments import flags as config_flags
 from experiments import train
-from srl_jax import checkpoint
+from experiments.command_line import flags as config_flags
 from srl_jax.config import Config, git_revision
-from srl_jax.metrics import read_metrics, strip_wall
+from srl_jax.files import checkpoint
+from srl_jax.files.metrics import read_metrics, strip_wall
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -5,8 +5,8 @@ import shutil
 
 import pytest
 
-from srl_jax import checkpoint
 from srl_jax.errors import ConfigError
+from srl_jax.files import checkpoint
 
 ABOUT = (checkpoint.MANIFEST, checkpoint.CHECKSUM)
 

@@ -15,8 +15,8 @@ import subprocess
 import jax
 import pytest
 
-from srl_jax import checkpoint
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files import checkpoint
 from tests.soak.conftest import ROOT, SMALL_RUN, different, remains, small_chunks, train_here
 from tests.soak.faults import Faults
 from tests.soak.kills_test import ENVIRONMENT, command, flags_of, life

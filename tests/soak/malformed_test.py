@@ -10,7 +10,7 @@ import sys
 
 import pytest
 
-from srl_jax import checkpoint
+from srl_jax.files import checkpoint
 from tests.helpers import SMALL, write_checkpoint, write_run
 from tests.malformed.conftest import DRAW, EVALUATE, OVERWRITE, START, listing
 from tests.malformed.files_test import NO_FILES, TEXTS, TRAPS, put

@@ -14,7 +14,8 @@ import sys
 import time
 from pathlib import Path
 
-from srl_jax import checkpoint, ending
+from srl_jax.files import checkpoint
+from srl_jax.run import ending
 from tests.helpers import write_checkpoint, write_run
 from tests.soak.conftest import ROOT, rows_of
 

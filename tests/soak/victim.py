@@ -12,8 +12,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import flags as config_flags
 from experiments import train
+from experiments.command_line import flags as config_flags
 from tests.soak.faults import Faults
 
 

@@ -10,19 +10,19 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax import checkpoint
-from srl_jax.actor import FrameStack, Policy, make_env, random_policy, seed_for, yielding_threads
 from srl_jax.agent import Agent
-from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config
 from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
-from srl_jax.evaluate import Evaluation, evaluate
+from srl_jax.files import checkpoint
+from srl_jax.files.checkpoint import Manifest
 from srl_jax.loading import greedy_policy
 from srl_jax.optim import real_copy
 from srl_jax.replay import Replay, fitting
-from srl_jax.reporting import Report
-from srl_jax.schedules import Now
+from srl_jax.run.actor import FrameStack, Policy, make_env, random_policy, seed_for, yielding_threads
+from srl_jax.run.evaluate import Evaluation, evaluate
+from srl_jax.run.reporting import Report
+from srl_jax.run.schedules import Now
 from srl_jax.types import Params, TrainState
 from srl_jax.update import named_key
 
@@ -260,7 +260,7 @@ class Seed:
         self.save_parameters(params, env_steps, updates, folder="encoders", keep=0)
 
     def save_parameters(self, params: Params, env_steps: int, updates: int, **options: Any) -> Manifest:
-        """Writes a checkpoint, without options of parameters alone; see `srl_jax.checkpoint.save`."""
+        """Writes a checkpoint, without options of parameters alone; see `srl_jax.files.checkpoint.save`."""
         return checkpoint.save(
             self.out,
             params,

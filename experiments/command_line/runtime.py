@@ -19,8 +19,8 @@ import sys
 from collections.abc import Mapping, MutableMapping
 from pathlib import Path
 
-from srl_jax import display
 from srl_jax.errors import ConfigError
+from srl_jax.files import display
 
 from . import control_groups
 

@@ -11,9 +11,9 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from srl_jax import display
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files import display
 
 LOCK = "lock"
 

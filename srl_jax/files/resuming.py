@@ -4,12 +4,14 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from srl_jax import checkpoint, config, display, ending, loggers, provenance, rundir
-from srl_jax.checkpoint import Manifest
+from srl_jax import config
 from srl_jax.config import MAY_CHANGE, SOURCES, Config, another_run
 from srl_jax.errors import ConfigError, saving
-from srl_jax.metrics import read_metrics
-from srl_jax.reading import read_json
+from srl_jax.files import checkpoint, display, loggers, provenance, rundir
+from srl_jax.files.checkpoint import Manifest
+from srl_jax.files.metrics import read_metrics
+from srl_jax.files.reading import read_json
+from srl_jax.run import ending
 
 
 def say(line: str) -> None:
@@ -74,7 +76,7 @@ def to_resume(path: Path, wanted: Config, at_most: int | None = None) -> Manifes
 
     Returns:
         The manifest of the newest one that is whole, or None where the run has to begin. One without
-        `srl_jax.checkpoint.NUMBERS` among its files is of a run that has ended.
+        `srl_jax.files.checkpoint.NUMBERS` among its files is of a run that has ended.
 
     Raises:
         ConfigError: another process writes there, or the run has another configuration, or its checkpoints
@@ -150,7 +152,7 @@ def _by_the_end(wanted: Config) -> str:
 
 
 def _changes(path: Path, about: dict) -> dict[str, tuple]:
-    """`srl_jax.provenance.changes` of a run directory's config.json."""
+    """`srl_jax.files.provenance.changes` of a run directory's config.json."""
     try:
         return provenance.changes(about)
     except ValueError as error:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from srl_jax.errors import ConfigError, Diverged, SaveError, saving
-from srl_jax.reading import read_json, replace_text
+from srl_jax.files.reading import read_json, replace_text
 
 FILE = "ended.json"
 STATUSES = ("finished", "stopped", "diverged", "failed")

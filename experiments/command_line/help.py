@@ -7,9 +7,10 @@ from typing import Any
 
 from absl import flags
 
-from srl_jax import display, specs
+from srl_jax import specs
+from srl_jax.files import display
 
-from .presets import PIECES, PIECES_HELP, PRESETS, summary
+from ..presets import PIECES, PIECES_HELP, PRESETS, summary
 
 GROUPS: dict[str, str] = {
     "Run": "preset config mode steps seed seeds import",
@@ -90,7 +91,8 @@ def _flag(name: str, values: flags.FlagValues) -> Iterator[str]:
 
 def _rows() -> dict[str, dict[str, dict[str, Any]]]:
     """{flag: {row of its registry: {option: default}}}; imports jax."""
-    from srl_jax import encoders, loggers, objectives, rl
+    from srl_jax import encoders, objectives, rl
+    from srl_jax.files import loggers
 
     registries = {"rl": rl.REGISTRY, "encoder": encoders.REGISTRY, "objective": objectives.REGISTRY}
     registries["logger"] = loggers.REGISTRY

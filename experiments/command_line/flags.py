@@ -15,14 +15,15 @@ from typing import Any, NoReturn
 
 from absl import app, flags
 
-from srl_jax import display, loggers, modes, plugins, specs
+from srl_jax import modes, plugins, specs
 from srl_jax.config import INFOS, Config, unresolved
 from srl_jax.errors import EXIT_STATUS, ConfigError
-from srl_jax.reading import SETTINGS, read_bytes
+from srl_jax.files import display, loggers
+from srl_jax.files.reading import SETTINGS, read_bytes
 from srl_jax.specs import Info
 
+from ..presets import ENCODER_PRESETS, preset_values, source_preset
 from . import help
-from .presets import ENCODER_PRESETS, preset_values, source_preset
 
 # The flags count as the entry point's own, so that --help shows them.
 flags.disclaim_key_flags()
@@ -106,7 +107,7 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
 
 
 def define_runtime_flag(values: flags.FlagValues = flags.FLAGS) -> None:
-    """Defines --tune_runtime, see `experiments.runtime`; no field of Config, for it changes no setting."""
+    """Defines --tune_runtime, see `runtime`; no field of Config, for it changes no setting."""
     help_text = "auto: set variables that make jax faster on a CPU, restarting once if need be; off: set none"
     define("tune_runtime", Info(str, help_text, choices=("auto", "off")), "auto", values)
 

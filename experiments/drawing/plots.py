@@ -17,7 +17,7 @@ from srl_jax import envs, statistics
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 
-from . import collect
+from ..runs import collect
 from .colours import Style, styles
 
 STEPS_LABEL = "env steps"

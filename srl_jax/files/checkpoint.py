@@ -5,7 +5,7 @@ A checkpoint is `checkpoints/ENV_STEPS` of a run:
     manifest.json     configuration, counts, and bytes and sha256 of every other file
     manifest.sha256   the manifest's own, as sha256sum writes and checks it
     params.msgpack    {"encoder": tree, OBJECTIVE: tree}
-    NAME.msgpack, NAME.npy, run.json: what else a run needs to resume, see `srl_jax.seed.Seed.parts`
+    NAME.msgpack, NAME.npy, run.json: what else a run needs to resume, see `srl_jax.run.seed.Seed.parts`
 
 It is written to a temporary directory, each file flushed to disk, the manifest last, and renamed. Large
 arrays come in chunks; one that has not changed since the checkpoint before is a hard link to its. The sums
@@ -26,7 +26,7 @@ import numpy as np
 
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.reading import read_bytes
+from srl_jax.files.reading import read_bytes
 
 MANIFEST, CHECKSUM, PARAMS, NUMBERS = "manifest.json", "manifest.sha256", "params.msgpack", "run.json"
 FORMAT = 4

@@ -19,8 +19,8 @@ import numpy as np
 
 from srl_jax import plugins
 from srl_jax.errors import ConfigError, saving
+from srl_jax.files.reading import SETTINGS, parse_json, read_bytes, replace_text
 from srl_jax.plugins import Registry
-from srl_jax.reading import SETTINGS, parse_json, read_bytes, replace_text
 from srl_jax.specs import parse
 
 FILE = "loggers.json"

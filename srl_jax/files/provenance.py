@@ -88,7 +88,7 @@ def git_revision() -> str | None:
 
     None where there is no git, no commit, or the package is merely installed below another checkout.
     """
-    root = Path(__file__).resolve().parents[1]
+    root = Path(__file__).resolve().parents[2]
 
     def git(*arguments: str) -> str:
         command = ["git", "-C", str(root), *arguments]

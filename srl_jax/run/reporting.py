@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from srl_jax import display
 from srl_jax.config import Config
-from srl_jax.display import Display, Progress
 from srl_jax.errors import saving
-from srl_jax.evaluate import Evaluation
-from srl_jax.loggers import Loggers
-from srl_jax.metrics import Mark, MetricsWriter, read_metrics
+from srl_jax.files import display
+from srl_jax.files.display import Display, Progress
+from srl_jax.files.loggers import Loggers
+from srl_jax.files.metrics import Mark, MetricsWriter, read_metrics
+from srl_jax.run.evaluate import Evaluation
 
 SOMETIMES = ("grad_norm/", "step_ratio/")
 """How the names of metrics begin that only some updates measure; see `srl_jax.optim.NOT_MEASURED`."""

@@ -13,8 +13,8 @@ from srl_jax.data import thesis_curve
 from srl_jax.diagnostics import drift
 from srl_jax.errors import ConfigError
 
+from ..runs.run_data import read_rows
 from . import images, plots
-from .run_data import read_rows
 
 GIF_SIZE = 84
 """Pixels: the longer side of play.gif, where frames are smaller by a whole factor."""
@@ -38,7 +38,7 @@ def draw_run(
         run: the run directory.
         config: of the run.
         thesis: FIGURE/ARM, a curve of the thesis to draw beside the run's own; empty for none.
-        pictures: {objective: (inputs, targets, outputs)}, see `srl_jax.loop.Result`.
+        pictures: {objective: (inputs, targets, outputs)}, see `srl_jax.run.loop.Result`.
         recording: uint8 [T, H, W, C], likewise; play.gif.
 
     Returns:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from srl_jax.sumtree import SumTree
+from srl_jax.replay.sumtree import SumTree
 from srl_jax.types import Window
 
 _ALL = slice(None)  # streams

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srl_jax.errors import ConfigError
-from srl_jax.reading import ROWS, parse_json, read_bytes
+from srl_jax.files.reading import ROWS, parse_json, read_bytes
 
 KINDS = ("train", "eval")
 LEADING = ("kind", "env_steps", "updates", "wall_s")
@@ -122,7 +122,7 @@ def read_metrics(path: str | os.PathLike) -> list[dict[str, Any]]:
         The rows in the order of the file; null is None.
 
     Raises:
-        OSError: if it cannot be read, see `srl_jax.reading.read_bytes`.
+        OSError: if it cannot be read, see `srl_jax.files.reading.read_bytes`.
         ValueError: if any other line is not a JSON object, naming the file and the line.
     """
     lines = read_bytes(path, ROWS).split(b"\n")

@@ -7,12 +7,13 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
-from srl_jax import config, ending
+from srl_jax import config
+from srl_jax.run import ending
 from srl_jax.config import Config
 from srl_jax.diagnostics.drift import STEPS, drift_matrix, drift_names
-from srl_jax.ending import Ending
+from srl_jax.run.ending import Ending
 from srl_jax.errors import ConfigError
-from srl_jax.metrics import KINDS, read_metrics
+from srl_jax.files.metrics import (KINDS, read_metrics)
 from srl_jax.specs import LIMITS
 
 
@@ -133,7 +134,7 @@ def run_directories(root: Path) -> list[Path]:
 
 
 def read_rows(path: Path) -> list[dict]:
-    """`srl_jax.metrics.read_metrics`, with what is drawn of each row checked.
+    """`srl_jax.files.metrics.read_metrics`, with what is drawn of each row checked.
 
     Raises:
         ConfigError: it cannot be read, or holds something else than training writes; one line.

@@ -5,7 +5,8 @@ import os
 import sys
 from typing import NamedTuple
 
-from srl_jax import display, specs
+from srl_jax import specs
+from srl_jax.files import display
 
 from . import flags as config_flags
 
@@ -57,4 +58,4 @@ def main() -> None:
     sys.argv[:] = [f"srl-jax {name}", *rest]
     if (here := os.getcwd()) not in sys.path:  # as `python -m` has it: --game=module:Name-v0 may lie here
         sys.path.append(here)
-    importlib.import_module(f".{COMMANDS[name].module or name}", __package__).cli()
+    importlib.import_module(f"..{COMMANDS[name].module or name}", __package__).cli()

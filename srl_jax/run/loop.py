@@ -15,17 +15,18 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax import checkpoint, ending
-from srl_jax.actor import make_env, yielding_threads
 from srl_jax.agent import Agent, make_agent, over_seeds
-from srl_jax.checkpoint import Manifest
 from srl_jax.config import Config
 from srl_jax.diagnostics.pictures import pictures
-from srl_jax.ending import Ending
 from srl_jax.errors import ConfigError, Diverged, SaveError
+from srl_jax.files import checkpoint
+from srl_jax.files.checkpoint import Manifest
 from srl_jax.loading import given_policy, initial_params
-from srl_jax.schedules import Now, Schedules, passed
-from srl_jax.seed import Seed
+from srl_jax.run import ending
+from srl_jax.run.actor import make_env, yielding_threads
+from srl_jax.run.ending import Ending
+from srl_jax.run.schedules import Now, Schedules, passed
+from srl_jax.run.seed import Seed
 from srl_jax.types import Params
 from srl_jax.update import named_key
 
@@ -67,10 +68,10 @@ def train_seeds(
     stop: Callable[[], bool] = lambda: False,
     agent: Agent | None = None,
 ) -> list[Result]:
-    """Trains an agent of each seed, in step, writing `metrics.jsonl` and `checkpoints/` into run directories.
+    """Trains an agent of each seed, in step, writing rows and checkpoints into run directories.
 
-    How a run ended goes to its `ended.json`, see `srl_jax.ending`; a ConfigError changes nothing there. What
-    stops one seed stops all, and a return that ends a run early must be reached by all in one evaluation.
+    How a run ended goes to its `ended.json`, see `srl_jax.run.ending`; a ConfigError changes nothing there.
+    What stops one seed stops all; a return that ends a run early must be reached by all in one evaluation.
 
     Args:
         config: of the runs, resolved; its seed does not matter.
@@ -78,7 +79,7 @@ def train_seeds(
         outs: their run directories, which exist.
         progress: whether to draw a progress bar on stderr, the first seed's.
         resume: a checkpoint of each to resume from, of the same configuration and env step, found whole by
-            `srl_jax.checkpoint.verify`; what follows is what would have followed had the run not ended there.
+            `checkpoint.verify`; what follows is what would have followed had the run not ended there.
         stop: asked before each step; once it says so, a checkpoint is written and training ends. A
             KeyboardInterrupt instead leaves the last checkpoint.
         agent: of this configuration, where it is made already.

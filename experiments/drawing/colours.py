@@ -9,7 +9,7 @@ import functools
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
-from .arms import FIGURES
+from ..arms import FIGURES
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette: distinguishable to colour-blind readers."""

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from srl_jax.actor import FrameStack, Policy
+from srl_jax.run.actor import FrameStack, Policy
 
 
 class Evaluation(NamedTuple):

@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from srl_jax.actor import linear
 from srl_jax.config import Config
 from srl_jax.modes import MODES
+from srl_jax.run.actor import linear
 from srl_jax.update import Hyper
 
 
