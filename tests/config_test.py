@@ -169,9 +169,9 @@ def test_save_and_load(tmp_path):
 def test_git_revision(tmp_path, monkeypatch):
     for variable in ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE"):
         monkeypatch.delenv(variable, raising=False)
-    package = tmp_path / "srl_jax"
-    package.mkdir()
-    source = package / "config.py"
+    package = tmp_path / "srl_jax" / "files"
+    package.mkdir(parents=True)
+    source = package / "provenance.py"
     source.write_text("1")
     monkeypatch.setattr(provenance, "__file__", str(source))
 

@@ -45,7 +45,7 @@ def test_rows_and_their_options_are_listed_below_their_flag():
     for registry in (rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY):
         for name in registry:
             assert f" {name}:" in page
-    assert " inverse:weight=1.0,hidden=256 " in page
+    assert " inverse:weight=1.0,hidden=256,steps=1 " in page
     assert " sac_ae:features=256,layer_norm=true," in page
     assert " none stands for no logger tensorboard wandb:project= csv --" in page
     assert " double:double=true,dueling=false,noisy=false," in page
