@@ -191,8 +191,8 @@ def test_git_revision(tmp_path, monkeypatch):
     source.write_text("2")
     assert provenance.git_revision() == git("rev-parse", "HEAD") + "-dirty"
     # Installed somewhere below another project's checkout: its commit says nothing about us.
-    (tmp_path / "site-packages" / "srl_jax").mkdir(parents=True)
-    below = tmp_path / "site-packages" / "srl_jax" / "config.py"
+    (tmp_path / "site-packages" / "srl_jax" / "files").mkdir(parents=True)
+    below = tmp_path / "site-packages" / "srl_jax" / "files" / "provenance.py"
     monkeypatch.setattr(provenance, "__file__", str(below))
     assert provenance.git_revision() is None
 
