@@ -15,6 +15,7 @@ from experiments.benchmarks.bench import CheckFailed
 from experiments.benchmarks.rows import GROUPS, Row
 from experiments.benchmarks.worker import Worker, WorkerError
 from experiments.command_line import flags as config_flags
+from srl_jax import objectives
 from srl_jax.errors import ConfigError
 from tests.helpers import SMALL
 
@@ -210,8 +211,12 @@ def _values(*arguments):
 
 
 def test_rows_are_chosen_in_the_tables_order():
-    assert bench.chosen_rows(None) == list(bench.ROWS)
+    assert bench.chosen_rows(None) == bench.MAIN
     assert bench.chosen_rows(["memory", "loop"]) == ["loop", "memory"]
+    assert bench.chosen_rows(["objectives", "loop"]) == [
+        "loop",
+        *(f"objective_{name}" for name in objectives.REGISTRY),
+    ]
 
 
 @pytest.mark.parametrize(

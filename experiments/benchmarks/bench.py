@@ -31,12 +31,14 @@ from srl_jax.specs import Info, choices_text
 
 from ..command_line import flags as config_flags
 from ..command_line import runtime
-from .rows import GROUPS, Group
+from .rows import GROUPS, OF_OBJECTIVES, Group
 from .worker import ROOT, Worker, WorkerError
 
 FLAGS = flags.FLAGS
 PYTHON = ".venv-bench/bin/python"
-ROWS = {name: row for group in GROUPS for name, row in group.rows.items()}
+ROWS = {name: row for group in (*GROUPS, *OF_OBJECTIVES) for name, row in group.rows.items()}
+MAIN = [name for group in GROUPS for name in group.rows]
+"""The rows that are measured where none is chosen."""
 CHECK_UPDATES = 2
 """Updates whose losses must be equal; the second one's depend on the first one's gradients."""
 TOLERANCE = 1e-4
@@ -53,7 +55,12 @@ class CheckFailed(RuntimeError):
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
     config_flags.define("rounds", Info(int, "how often each worker takes its turn", minimum=1), 7, values)
-    flags.DEFINE_list("only", None, f"rows to measure, of: {', '.join(ROWS)}", flag_values=values)
+    flags.DEFINE_list(
+        "only",
+        None,
+        f"rows to measure, of: {', '.join(MAIN)}; objectives for what each costs",
+        flag_values=values,
+    )
     out = "directory for bench.json and bench.md; must be new or empty"
     flags.DEFINE_string("out", None, out, flag_values=values)
     other = "interpreter that has PyTorch and Tianshou"
@@ -63,17 +70,19 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
 
 
 def chosen_rows(only: Sequence[str] | None) -> list[str]:
-    """The rows that --only names, in the table's order; None: all.
+    """The rows that --only names, in the table's order; None: all but those of objectives.
 
     Raises:
         ConfigError: there is no such row.
     """
     if only == []:
         raise ConfigError(f"--only=: names no row; {choices_text('', ROWS)}")
-    for name in only or []:
-        if name not in ROWS:
-            raise ConfigError(f"--only={name}: {choices_text(name, ROWS)}")
-    return [name for name in ROWS if not only or name in only]
+    chosen = set(MAIN if only is None else only)
+    if "objectives" in chosen:
+        chosen = chosen - {"objectives"} | {name for group in OF_OBJECTIVES for name in group.rows}
+    for name in chosen - ROWS.keys():
+        raise ConfigError(f"--only={name}: {choices_text(name, [*ROWS, 'objectives'])}")
+    return [name for name in ROWS if name in chosen]
 
 
 def check_out(out: str | None) -> Path | None:
@@ -243,7 +252,7 @@ def bench(values: flags.FlagValues) -> None:
             "PyTorch and Tianshou are not there, `make bench-install` installs them; their rows are skipped"
         )
     replies, checks = {}, {}
-    for group in GROUPS:
+    for group in (*GROUPS, *OF_OBJECTIVES):
         chosen = [name for name in rows if name in group.rows]
         if not about["other_versions"]:
             chosen = [name for name in chosen if not any(x.is_other for x in group.needed([name]).values())]

@@ -161,7 +161,7 @@ def _cost(title: str, ours: str, theirs: str, label: str, goal: str = "") -> Row
     return Row(title, "ms", f"{ours}.update", {label: f"{theirs}.update"}, goal)
 
 
-NATURE, JOINT = "thesis/rl_only_nature", "thesis/joint_256"
+NATURE, JOINT, SMALL = "thesis/rl_only_nature", "thesis/joint_256", "small/rl_only_256"
 
 UPDATE = Group(
     _both("nature", NATURE, 60), {"update_nature": _beside_pytorch("rl_only nature", "nature", ">= 1.8")}
@@ -225,3 +225,19 @@ MEMORY = Group(
 
 GROUPS = (UPDATE, UPDATES_OF_256, LOOP, REPLAY, STARTUP, MEMORY)
 """The table, in order."""
+
+OBJECTIVES = (
+    "reconstruction forward_pixels vae forward_latent spr byol vicreg barlow infonce slowness inverse reward "
+    "terminal bisimulation latent_l2"
+).split()
+
+
+def _objective(name: str) -> Group:
+    """What an objective adds to an update of RL alone, at the size of Catch, one Adam on the sum."""
+    beside = _ours(SMALL, 60, mode="joint", objectives=(name,), encoder_optimizer="summed")
+    row = _cost(f"RL and {name} / RL", name, "alone", "RL alone")
+    return Group({"alone": _ours(SMALL, 60), name: beside}, {f"objective_{name}": row})
+
+
+OF_OBJECTIVES = tuple(_objective(name) for name in OBJECTIVES)
+"""Another table, `--only=objectives`."""
