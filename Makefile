@@ -19,12 +19,12 @@ STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
 # Tests that start few processes and compile little, half a minute in all.
-FAST := actor arms augment colours compare config control_groups data docs ending envs_base help metrics \
+FAST := actor api_docs arms augment colours compare config control_groups data docs ending envs_base help metrics \
 	optim plots reading replay replay_machine rl_losses run_data rundir specs statistics sumtree \
 	sweeping_plan sweeping_status window
 
 .DEFAULT_GOAL := help
-.PHONY: help install check test train lint soak bench bench-gpu bench-install
+.PHONY: help install check test train lint docs soak bench bench-gpu bench-install
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
@@ -54,6 +54,9 @@ test: install ## run all tests
 train: install ## train on Pong for about three minutes (two cores), into a new directory under runs/
 	@$(VENV)/bin/python -m experiments.train $(call unless,--preset=,demo) \
 		$(call unless,--out=,runs/demo-$$(date +%Y%m%d-%H%M%S)) $(ARGS)
+
+docs: install ## write the API reference, build/docs/index.html
+	@$(VENV)/bin/python docs/api.py build/docs && echo build/docs/index.html
 
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .

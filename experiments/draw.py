@@ -21,7 +21,7 @@ def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
     if not FLAGS.run:
-        raise ConfigError("--run: missing; name a run directory, --run=runs/NAME")
+        raise ConfigError("--run: missing; name a run directory, srl-jax draw runs/NAME")
     config = Config.load(FLAGS.run)
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")

@@ -42,7 +42,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     """
     del argv
     if not FLAGS.run:
-        raise ConfigError("--run: missing; name a run directory or a checkpoint, --run=runs/NAME")
+        raise ConfigError("--run: missing; name a run directory or a checkpoint, srl-jax evaluate runs/NAME")
     if FLAGS.gif:
         check_gif(FLAGS.gif)
     from srl_jax.files import checkpoint

@@ -21,7 +21,7 @@ def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
     if not FLAGS.run:
-        raise ConfigError("--run: missing; name a run directory or a checkpoint, --run=runs/NAME")
+        raise ConfigError("--run: missing; name a run directory or a checkpoint, srl-jax export runs/NAME")
     if not FLAGS.encoder:
         raise ConfigError("--encoder: missing; name the file to write, --encoder=enc.npz")
     path = config_flags.check_file("encoder", FLAGS.encoder, ".npz", overwrite=FLAGS.overwrite)

@@ -49,7 +49,7 @@ def check_out(out: str | None, *, overwrite: bool) -> Path:
         ConfigError: it cannot, or there is a file that must not be overwritten.
     """
     if not out:
-        raise ConfigError("--out: missing; name a file, --out=report.html")
+        raise ConfigError("--out: missing; name the page to write, --out=report.html")
     if Path(out).suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"--out={out}: must end in .html")
     config_flags.check_name("out", out)
@@ -99,7 +99,7 @@ def report(values: flags.FlagValues) -> Path:
     """
     runs = values["runs"].value
     if not runs:
-        raise ConfigError("--runs: missing; name a directory of runs, python -m experiments.report runs/")
+        raise ConfigError("--runs: missing; name a directory of runs, srl-jax report runs")
     path = check_out(values["out"].value, overwrite=values["overwrite"].value)
     reach = check_reach(values["reach"].value)
     for root in runs:
@@ -126,7 +126,7 @@ def main(argv: list[str]) -> None:
     del argv
     path = report(FLAGS)
     for file in (path, path.with_suffix(".csv")):
-        print(f"{file}: {file.stat().st_size / 1e6:.1f} MB")
+        print(f"{file}: {file.stat().st_size / 1e3:,.0f} kB")
 
 
 def cli() -> None:

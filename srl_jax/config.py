@@ -25,6 +25,9 @@ _RENAMED = {"lr_final": "lr_final_share"}
 
 FILE = "config.json"
 
+_KINDS = specs.KINDS | {tuple: "a tuple of texts, as ('reconstruction:weight=1',)"}
+"""What each kind of value is called in an error."""
+
 
 def _value(kind: type, default: Any, help: str, unit: str = "", **limits: Any) -> Any:
     return dataclasses.field(default=default, metadata={"info": Info(kind, help, unit, **limits)})
@@ -227,7 +230,7 @@ class Config:
                 right_type = all(type(element) is str for element in value)
             flag = info.flag or name
             if not right_type:
-                raise ConfigError(f"--{flag}={value!r}: not of type {info.kind.__name__}")
+                raise ConfigError(f"--{flag}={value!r}: not {_KINDS[info.kind]}")
             if isinstance(value, float) and not abs(value) < float("inf"):
                 raise ConfigError(f"--{flag}={value}: not a finite number")
             try:

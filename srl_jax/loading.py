@@ -47,6 +47,10 @@ class Loaded:
 
         self._encode, self._q_values = jax.jit(agent.encoder.apply), jax.jit(q_values)
 
+    def __repr__(self) -> str:
+        names = ", ".join(self.params)
+        return f"<{names} of {self.manifest.path}, {self.config.game} after {self.env_steps:,} env steps>"
+
     def encode(self, observations: Array) -> jax.Array:
         """The latents of observations, float32 [..., D].
 
@@ -76,8 +80,11 @@ class Loaded:
             rng: draws where epsilon is above 0; None for one of this object's own, which starts at seed 0.
 
         Raises:
-            srl_jax.errors.ConfigError, ValueError: see `q_values`.
+            srl_jax.errors.ConfigError: see `q_values`.
+            ValueError: see `q_values`, or epsilon is out of range.
         """
+        if not 0 <= epsilon <= 1:
+            raise ValueError(f"epsilon must be in [0, 1], not {epsilon}")
         values = self.q_values(observations)
         key = jax.random.key((rng or self._rng).integers(2**31) if epsilon > 0 else 0)
         coin_key, action_key = jax.random.split(key)
@@ -131,6 +138,8 @@ def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) 
         srl_jax.errors.ConfigError: there is none, it is damaged, does not fit this code, or something cannot
             be imported; one line.
     """
+    if Path(path).suffix == ".npz":
+        raise ConfigError(f"{path}: an exported encoder is read by srl_jax.encoders.from_npz")
     manifest = checkpoint.read_manifest(Path(path))
     plugins.load(map(plugins.located, manifest.config.imports if imports is None else imports))
     try:

@@ -57,10 +57,13 @@ class Registry(dict[str, Callable]):
         Raises:
             ConfigError: the name is no identifier or has a row already, or an option has no default.
         """
+        if not (isinstance(name, str) and name.isascii() and name.isidentifier()):
+            raise ConfigError(
+                f"srl_jax.{self.kind} takes no row {name!r}: a name is letters, digits and _, "
+                'as in register("mine")'
+            )
         if factory is None:
             return functools.partial(self.register, name)
-        if not (isinstance(name, str) and name.isascii() and name.isidentifier()):
-            raise ConfigError(f"srl_jax.{self.kind} takes no row {name!r}: a name is letters, digits and _")
         try:
             option_defaults(factory)
         except (TypeError, ValueError) as error:

@@ -22,7 +22,7 @@ count and compute."""
 MOST_UNITS = 2**16
 """The largest size of a layer that an option may ask for."""
 
-_KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
+KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
 
 class SpecError(ConfigError):
@@ -56,10 +56,15 @@ class Spec:
 
 
 def choices_text(given: str, names: Iterable[str]) -> str:
-    """`did you mean X? valid: ...`; suggests only where a name is near (letter case aside)."""
+    """`did you mean X? valid: ...`; suggests only where a name is near (letter case aside).
+
+    Beside a suggestion, a list that nobody would read is left to --help.
+    """
     names = sorted(names) if isinstance(names, Set) else list(names)
     close = near(given, names)
     suggestion = f"did you mean {close[0]}? " if close else ""
+    if close and len(names) > 20:
+        return f"{suggestion}--help lists all {len(names)}"
     return f"{suggestion}valid: {', '.join(names)}"
 
 
@@ -86,7 +91,7 @@ def parse_value(text: str, kind: type) -> bool | int | float | str:
     """
     if kind is str:
         return text
-    wrong = ValueError(f"not {_KINDS[kind]}")
+    wrong = ValueError(f"not {KINDS[kind]}")
     text = text.strip()
     if kind is bool:
         try:
@@ -242,7 +247,7 @@ def option_defaults(factory: Callable) -> dict[str, Any]:
     defaults = {}
     for parameter in inspect.signature(factory).parameters.values():
         if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
-            if type(parameter.default) not in _KINDS:
+            if type(parameter.default) not in KINDS:
                 raise TypeError(f"{factory}: {parameter.name} needs a bool, int, float or str default")
             defaults[parameter.name] = parameter.default
     return defaults

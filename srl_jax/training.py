@@ -31,8 +31,11 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
 
     Raises:
         ConfigError: the configuration cannot be run, or the directory is not empty; nothing was written.
+        TypeError: the configuration is no Config.
         SaveError, Diverged: see `srl_jax.run.loop.train_seeds`.
     """
+    if not isinstance(config, Config):
+        raise TypeError(f"config must be a srl_jax.Config, not {type(config).__name__}")
     path = Path(out)
     try:
         taken = path.exists() and (not path.is_dir() or any(path.iterdir()))

@@ -89,6 +89,8 @@ def test_epsilon_is_the_share_of_random_actions(loaded):
     assert abs((half != greedy).mean() - 1 / 3) < 0.07
     np.testing.assert_array_equal(half, loaded.act(x, 0.5, np.random.default_rng(2)))
     assert loaded.act(x, 0.5).tolist() != loaded.act(x, 0.5).tolist()
+    with pytest.raises(ValueError, match=r"epsilon must be in \[0, 1\], not 2"):
+        loaded.act(x, 2)
 
 
 def test_a_run_one_of_its_checkpoints_and_its_best(run, loaded):
@@ -133,6 +135,12 @@ def test_a_representation_run_has_no_policy(tmp_path):
 def test_what_is_no_checkpoint_is_refused(tmp_path):
     with pytest.raises(ConfigError, match="no checkpoint there; name a run directory or one of its"):
         srl_jax.load(tmp_path)
+    with pytest.raises(ConfigError, match="encoder is read by srl_jax.encoders.from_npz"):
+        srl_jax.load(tmp_path / "enc.npz")
+
+
+def test_what_is_loaded_says_what_it_is(loaded):
+    assert re.fullmatch(r"<encoder, .*rl of .*, Catch after [\d,]+ env steps>", repr(loaded))
 
 
 OWN = """

@@ -92,6 +92,11 @@ def test_a_name_can_be_written_in_a_specification(registry, name):
         registry.register(name, _row)
 
 
+def test_a_decorator_without_a_name_is_refused(registry):
+    with pytest.raises(ConfigError, match=r'as in register\("mine"\)'):
+        registry.register(_row)
+
+
 def test_options_have_defaults(registry):
     def row(context, *, weight):
         return weight

@@ -179,3 +179,6 @@ def test_names_that_may_have_been_meant():
     # A set has an order of its own in each process.
     assert specs.choices_text("q", {"b", "a", "c"}) == "valid: a, b, c"
     assert specs.choices_text("q", ["b", "a"]) == "valid: b, a"
+    many = [f"name_{i}" for i in range(21)]
+    assert specs.choices_text("name_30", many).endswith("? --help lists all 21")
+    assert specs.choices_text("q", many).startswith("valid: name_0, ")

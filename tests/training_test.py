@@ -54,6 +54,11 @@ def test_what_cannot_be_run_is_refused_and_leaves_nothing(values, message, tmp_p
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_mapping_is_no_configuration(tmp_path):
+    with pytest.raises(TypeError, match="^config must be a srl_jax.Config, not dict$"):
+        srl_jax.train(SMALL, tmp_path / "x")
+
+
 def test_a_file_is_no_place_for_a_run(tmp_path):
     (tmp_path / "x").write_text("mine")
     with pytest.raises(ConfigError, match="not an empty directory"):
