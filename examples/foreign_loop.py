@@ -1,4 +1,4 @@
-"""A loop of one's own on Catch: the replay and the losses of srl_jax over somebody else's network.
+"""A loop of your own on Catch: the replay and the losses of srl_jax over somebody else's network.
 
     python examples/foreign_loop.py
 

@@ -1,4 +1,4 @@
-"""An environment of one's own, 64 x 64 pixels in colour: a red dot has to be led to a green place.
+"""An environment of your own, 64 x 64 pixels in colour: a red dot has to be led to a green place.
 
     python -m experiments.train --game=examples.own_environment:Dot-v0 --frame_size=84 \
         --encoder=tiny --steps=20000 --out=runs/dot

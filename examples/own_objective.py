@@ -1,4 +1,4 @@
-"""An objective of one's own: latents that change slowly (Wiskott and Sejnowski 2002, slow feature analysis).
+"""An objective of your own: latents that change slowly (Wiskott and Sejnowski 2002, slow feature analysis).
 
     srl-jax train --import=examples/own_objective.py --preset=catch/joint \
         --objective=+continuity:weight=0.01 --out=runs/slow

@@ -1,6 +1,6 @@
 """The figures that runs are made for: which arms, and what is asked. Imports no jax.
 
-The thesis' six are a table here; a figure of one's own is a small JSON file:
+The thesis' six are a table here; a figure of your own is a small JSON file:
 
     {"name": "sparse", "title": "Representation losses in every fourth update", "arms": [
         {"name": "joint_256", "preset": "thesis/joint_256", "thesis": "6.3/joint_256"},
@@ -146,7 +146,7 @@ def figures_named(text: str) -> list[Figure]:
 
 
 def read_figure(path: Path) -> Figure:
-    """Reads a figure of one's own, see this module's docstring.
+    """Reads a figure of your own, see this module's docstring.
 
     Raises:
         ConfigError: it is not such a file; one line that names what is wrong.

@@ -6,7 +6,7 @@
     policy = srl_jax.load("runs/x")
     actions = policy.act(observations)  # uint8 [B, H, W, S * C] -> int32 [B]
 
-`losses`, `objectives`, `encoders` and `Replay` are parts for a loop of one's own. Each name is imported when
+`losses`, `objectives`, `encoders` and `Replay` are parts for a loop of your own. Each name is imported when
 it is first asked for; `import srl_jax` itself and `Config` import no jax.
 """
 

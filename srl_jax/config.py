@@ -43,7 +43,7 @@ def _share(default: float, help: str, unit: str = "probability") -> Any:
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Every value that determines a run. Each is checked on construction; see the fields' metadata.
+    """Every value that determines a run, checked on construction; `srl-jax train --help` says what each is.
 
     Raises:
         ConfigError: a value is of the wrong type or out of its limits; one line that names the
@@ -210,8 +210,8 @@ class Config:
     pretrain_epsilon: float = _share(0.3, "epsilon of the behaviour policy in --mode=pretrain")
     imports: tuple[str, ...] = _value(
         tuple, (),
-        "file (my_file.py) or module that registers own objectives, encoders, RL algorithms or loggers, see "
-        "srl_jax/plugins.py; may be repeated",
+        "file (my_file.py) or module that registers objectives, encoders, RL algorithms or loggers of your "
+        "own, see srl_jax/plugins.py; may be repeated",
         flag="import",
     )  # fmt: skip
 

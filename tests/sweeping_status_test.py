@@ -91,7 +91,9 @@ def test_a_dry_run_writes_nothing_and_counts(tmp_path):
         ["Catch/a", "2", "0", "2", "2,000", "100", "0:00:20"],
         ["Catch/b", "1", "0", "1", "1,000", "100", "0:00:10"],
     ]
-    assert lines[3:] == ["3 of 3 runs to run, 3,000 env steps, 0:00:15 with 2 at once"]
+    assert lines[3:] == [
+        "3 of 3 runs to run, 3,000 env steps, 0:00:15 with 2 at once; starting a run takes up to a minute more"
+    ]
     assert sorted(tmp_path.rglob("*")) == before
     slow = dataclasses.replace(CONFIG, encoder="tiny:features=77")
     line, why = status.dry_run(tmp_path / "new", entries(slow, **{"Catch/a/seed0": ""}), 2)[2:]

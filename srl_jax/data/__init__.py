@@ -1,4 +1,4 @@
-"""What others measured, to draw beside one's own, and where Atari games keep positions in memory."""
+"""What others measured, to draw beside your own, and where Atari games keep positions in memory."""
 
 import csv
 import functools

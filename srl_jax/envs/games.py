@@ -158,7 +158,7 @@ def adapted(
     frame_skip: int = 1,
     max_steps: int = 0,
 ) -> Game:
-    """The game of a gymnasium environment that is made by a function, for a row of one's own.
+    """The game of a gymnasium environment that is made by a function, for a row of your own.
 
         def dot(*, speed: int = 1):
             return adapted(lambda: Dot(speed))

@@ -1,6 +1,6 @@
 """Where rows go beside metrics.jsonl: `REGISTRY[name](out, config, **options) -> Logger`. Imports no jax.
 
-`--logger=csv,wandb:project=mine` names rows of the registry, `--logger=my_file.py:Mine` a class of one's own.
+`--logger=csv,wandb:project=mine` names rows of the registry, `--logger=my_file.py:Mine` a class of your own.
 `register` adds a row, see `srl_jax.plugins`.
 """
 
