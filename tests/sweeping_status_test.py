@@ -92,7 +92,7 @@ def test_a_dry_run_writes_nothing_and_counts(tmp_path):
         ["Catch/b", "1", "0", "1", "1,000", "100", "0:00:10"],
     ]
     assert lines[3:] == [
-        "3 of 3 runs to run, 3,000 env steps, 0:00:15 with 2 at once; starting a run takes up to a minute more"
+        "3 of 3 runs to run, 3,000 env steps, 0:00:15 with 2 at once; each start takes up to a minute more"
     ]
     assert sorted(tmp_path.rglob("*")) == before
     slow = dataclasses.replace(CONFIG, encoder="tiny:features=77")

@@ -250,7 +250,7 @@ def dry_run(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]
     if left:
         line += f", {hms(seconds) if seconds else 'unknown time'} with {workers} at once"
         line += f" and {unknown} runs of unknown speed" if seconds and unknown else ""
-        line += "; starting a run takes up to a minute more" if seconds else ""
+        line += "; each start takes up to a minute more" if seconds else ""
     lines.append(line)
     if unknown:
         lines.append(
