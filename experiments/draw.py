@@ -1,7 +1,7 @@
-"""Draws a run's figures from its metrics.jsonl: `python -m experiments.draw --run=runs/pong`.
+"""Draws a run's figures from its metrics.jsonl: `python -m experiments.draw runs/pong`.
 
-experiments.train does it by itself at the end of a run; this draws again, beside a curve of the thesis if
-asked: `--thesis=6.2/rl_only_nature`. experiments.compare draws several runs.
+A run draws its figures when it ends. This command draws them again, and `--thesis=6.2/rl_only_nature` adds a
+curve of the thesis. `srl-jax compare` draws several runs.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Plays full games from a checkpoint: `python -m experiments.evaluate --run=runs/pong --gif=pong.gif`.
+"""Plays full games from a checkpoint: `python -m experiments.evaluate runs/pong --gif=pong.gif`.
 
 Prints one JSON object: the game, the checkpoint's env steps, the mean, and every return and length.
 """

@@ -2,12 +2,11 @@
 
     python -m experiments.figures --figure=6.3 --games=Pong,Breakout --seeds=3 --steps=500000
 
-Every arm of the figure that has not been run yet is run, each seed as a process of its own that can be killed
-and resumed; then the figure is drawn: mean evaluation return over seeds with 95 % t intervals at each
-point, against env steps, over the thesis' own curve where there is one, with lines for what a random and a
-no-op policy score. FIGURE.png and FIGURE.json (its numbers) go to OUT/figures. Runs lie in OUT/GAME/ARM/seedN
-and are shared by all figures.
-Every flag of experiments.train that says something of a run goes to all of them.
+Every arm that has not been run yet is run, each seed in a process of its own that can be killed and resumed.
+Then the figure is drawn: the mean evaluation return over seeds against env steps, with 95 % t intervals. The
+thesis' own curve lies below it where there is one, and lines show what a random and a no-op policy score.
+OUT/figures gets FIGURE.png and FIGURE.json, its numbers. The runs lie in OUT/GAME/ARM/seedN, and all figures
+share them. Flags of `srl-jax train` beside these go to all runs.
 """
 
 import json

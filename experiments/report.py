@@ -1,9 +1,9 @@
-"""One self-contained page about many runs: `python -m experiments.report runs/ --out=report.html`.
+"""Writes one page about many runs: `python -m experiments.report runs/ --out=report.html`.
 
-The question and the answer, from the directory's README.md; what the numbers say, with intervals; curves of
-every seed, training, diagnostics, what the agents do and see, cost, and every difference between the arms. It
-opens offline. All rows lie beside it as a table, report.csv. Several directories are compared with each
-other: `python -m experiments.report runs/a runs/b --out=report.html`.
+The page begins with the question and the answer, which are the directory's README.md. Then come what the
+numbers say, with intervals; curves of every seed; training; diagnostics; what the agents do and see; cost;
+and every difference between the arms. It opens offline. All rows lie beside it as a table, report.csv. Several
+directories are compared with each other: `python -m experiments.report runs/a runs/b --out=report.html`.
 """
 
 import functools
