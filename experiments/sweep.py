@@ -1,15 +1,15 @@
 """Trains many agents: `python -m experiments.sweep --presets=thesis/* --games=Pong --seeds=5 --out=runs/all`.
 
-There is a run for each preset, game and seed, and for each encoder or policy that these start from. Each
-has a process and a run directory of its own, --out/GAME/ARM/seedN. Given again, the command runs what is missing.
+There is a run for each preset, game and seed, and for each encoder or policy that these start from. Each has
+a process and a run directory of its own, --out/GAME/ARM/seedN. Given again, the command runs what is missing.
 With --out alone it resumes everything that was ever planned there. Ctrl-C, SIGTERM, SIGHUP and SIGUSR1 write
 a checkpoint of each run and end the sweep. `--status` says how far a sweep is, `--dry_run` what one would do.
 `--grid=lr_rl=1e-4,3e-4 --grid=batch_size=32,64` tries each combination. At the end comes a table of the arms,
 the best one first.
 
 Flags of `srl-jax train` beside these go to every run. Of --steps, pretraining takes 0.3, as in the thesis.
-Bad input ends with one line on stderr and exit status 2 before anything is written. Exit
-status: 0 if all runs are complete, 1 if one failed, 3 if the disk is full, 128 + n after signal n.
+Bad input ends with one line on stderr and exit status 2 before anything is written. Exit status: 0 if all
+runs are complete, 1 if one failed, 3 if the disk is full, 128 + n after signal n.
 """
 
 from pathlib import Path
