@@ -3,8 +3,8 @@
 The page begins with the question and the answer, which are the directory's README.md. Then come what the
 numbers say, with intervals; curves of every seed; training; diagnostics; what the agents do and see; cost;
 and every difference between the arms. It opens offline. All rows lie beside it as a table, report.csv.
-Several directories are compared with each other: `python -m experiments.report runs/a runs/b
---out=report.html`.
+Several directories are compared with each other:
+`python -m experiments.report runs/a runs/b --out=report.html`.
 """
 
 import functools
