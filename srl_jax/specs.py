@@ -58,13 +58,13 @@ class Spec:
 def choices_text(given: str, names: Iterable[str]) -> str:
     """`did you mean X? valid: ...`; suggests only where a name is near (letter case aside).
 
-    Beside a suggestion, a list that nobody would read is left to --help.
+    Of more than 20 names, which nobody would read, only the near ones are listed.
     """
     names = sorted(names) if isinstance(names, Set) else list(names)
     close = near(given, names)
     suggestion = f"did you mean {close[0]}? " if close else ""
     if close and len(names) > 20:
-        return f"{suggestion}--help lists all {len(names)}"
+        return f"{suggestion}near: {', '.join(close)}; {len(names)} are valid"
     return f"{suggestion}valid: {', '.join(names)}"
 
 
