@@ -32,10 +32,10 @@ def loop(monkeypatch):
     """A stub in place of srl_jax.run.loop, see `tests.in_process.Loop`."""
     import sys
 
-    import srl_jax
+    import srl_jax.run
     from tests.in_process import Loop
 
     stub = Loop()
     monkeypatch.setitem(sys.modules, "srl_jax.run.loop", stub)
-    monkeypatch.setattr(srl_jax, "loop", stub, raising=False)
+    monkeypatch.setattr(srl_jax.run, "loop", stub, raising=False)
     return stub

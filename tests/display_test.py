@@ -250,7 +250,7 @@ def test_a_run_loses_no_row_when_the_reader_of_its_progress_goes(tmp_path, monke
 # Whole processes
 
 CODE = """
-from experiments import flags
+from experiments.command_line import flags
 def main(argv):
     print("Gem\\u00e4lde " * 10_000, flush=True)
     with open("file", "w") as file:

@@ -75,7 +75,7 @@ class Loop:
         now = run.state.params, frames, run.env_steps, run.now.epsilon
         milliseconds, steps = run.env_threads.submit(timed, run.act_and_step, *now).result()
         for seed, step in zip(run.seeds, steps, strict=True):
-            seed.take(step)
+            seed.take(*step)
         run.env_steps += run.config.num_envs
         return milliseconds
 
