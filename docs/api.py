@@ -4,6 +4,7 @@ A warning is an error: an annotation that nothing resolves, or a module that is 
 """
 
 import dataclasses
+import importlib
 import inspect
 import sys
 import typing
@@ -41,11 +42,14 @@ def main(out: str) -> None:
 
     typing.TYPE_CHECKING = False
     jax.Array.__qualname__ = "Array"  # jax.Array, and not where it is built
-    for value in vars(srl_jax.types).values():
-        if inspect.isclass(value) and issubclass(value, tuple):
-            value.__new__.__module__ = value.__module__  # where its annotations are looked up
-            for field in value._fields:  # the docstring has them, and not their numbers
-                getattr(value, field).__doc__ = ""
+    for module in map(importlib.import_module, pdoc.extract.walk_specs(PUBLIC)):
+        for value in vars(module).values():
+            if inspect.isclass(value) and hasattr(value, "_fields"):
+                value.__new__.__module__ = value.__module__  # where its annotations are looked up
+                for field in value._fields:  # the docstring has them, and not their numbers
+                    getattr(value, field).__doc__ = ""
+    # Every flax module has this one, and nobody who reads about it needs it.
+    type(vars(srl_jax.layers.Dense)["parent"]).__doc__ = ""
     _document_fields(srl_jax.Config)
 
     warnings.simplefilter("error")
