@@ -75,7 +75,7 @@ class End(NamedTuple):
     end: str = "default"
     pool: str = "none"
 
-    def latent(self, map_shape: tuple[int, ...], features: int, own: str = "none") -> "Latent":
+    def latent(self, map_shape: tuple[int, int, int], features: int, own: str = "none") -> "Latent":
         """The latent of these options.
 
         Args:
@@ -104,7 +104,7 @@ class Latent(NamedTuple):
         pool: one of `POOLS`.
     """
 
-    map_shape: tuple[int, ...]
+    map_shape: tuple[int, int, int]
     features: int
     end: str
     pool: str
@@ -143,7 +143,7 @@ class Latent(NamedTuple):
         yield {"step": "average" if self.pool == "average" else "flatten"}
         if self.features:
             yield {"step": "dense", "parameters": "Dense_0"}
-        more = {
+        more: dict[str, dict[str, Any]] = {
             "layer_norm": {"parameters": "LayerNorm_0", "epsilon": EPSILON},
             "min_max": {"least": MIN_RANGE},
             "sim_norm": {"group": GROUP},
