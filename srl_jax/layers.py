@@ -20,6 +20,8 @@ Pads: TypeAlias = tuple[tuple[int, int], tuple[int, int]]
 """Zeros around an image: ((above, below), (left, right))."""
 Padding: TypeAlias = str | int | Pads
 """See `Conv.padding`."""
+MIN_RANGE = 1e-5
+"""The least that `min_max` divides by."""
 FEW_ROWS = 16
 """A noisy layer of no more rows multiplies by mu and by sigma, and does not write down their noisy sum."""
 
@@ -52,6 +54,35 @@ def he_normal(fan_in: float):
     return init
 
 
+def xavier_uniform(fan_in: float):
+    """An initialiser: U(-b, b), b = sqrt(6 / (fan_in + fan_out)), for kernels [..., inputs, features].
+
+    Glorot and Bengio (2010), equation 16; what Dopamine has, as flax computes it: `fan_out` is to `fan_in` as
+    features are to inputs.
+    """
+
+    def init(key, shape, dtype=jnp.float32):
+        bound = math.sqrt(6.0 / (fan_in * (1.0 + shape[-1] / shape[-2])))
+        return jax.random.uniform(key, shape, dtype, -bound, bound)
+
+    return init
+
+
+def orthogonal(fan_in: float):
+    """An initialiser: kernels [..., features] whose columns are orthogonal, with he_normal's variance.
+
+    A kernel is a matrix [inputs of a feature, features]; where it has more columns than rows, its rows are
+    orthogonal (Saxe et al. 2014). Where all its inputs reach an output, `fan_in` of them, the gain is
+    sqrt(2), for kernels below a ReLU.
+    """
+
+    def init(key, shape, dtype=jnp.float32):
+        gain = math.sqrt(2.0 * math.prod(shape[:-1]) / fan_in)
+        return nn.initializers.orthogonal(gain)(key, shape, dtype)
+
+    return init
+
+
 def zeros(key: Array, shape: tuple, dtype=jnp.float32) -> Array:
     """An initialiser: 0. flax's own is float64 where jax may use 64 bits."""
     return jnp.zeros(shape, dtype)
@@ -60,6 +91,8 @@ def zeros(key: Array, shape: tuple, dtype=jnp.float32) -> Array:
 INITIALISERS = {
     "pytorch": lambda fan_in: (uniform_fan_in(fan_in), uniform_fan_in(fan_in)),
     "he": lambda fan_in: (he_normal(fan_in), zeros),
+    "xavier": lambda fan_in: (xavier_uniform(fan_in), zeros),
+    "orthogonal": lambda fan_in: (orthogonal(fan_in), zeros),
 }
 """{name: fan_in -> (the initialiser of a convolution's kernel, that of its bias)}."""
 
@@ -83,6 +116,23 @@ def zero_sum(init):
 def scaled(init, factor: float):
     """Another initialiser's values, multiplied."""
     return lambda key, shape, dtype=jnp.float32: factor * init(key, shape, dtype)
+
+
+def min_max(z: Array) -> Array:
+    """Latents moved and scaled into [0, 1], each by its own range: float32 [..., D] -> [..., D] (SPR's code).
+
+    A constant becomes 0.
+    """
+    low = jnp.min(z, -1, keepdims=True)
+    return (z - low) / jnp.maximum(jnp.max(z, -1, keepdims=True) - low, MIN_RANGE)
+
+
+def sim_norm(z: Array, group: int) -> Array:
+    """Softmax over each `group` neighbouring numbers: float32 [..., D] -> [..., D], D a multiple of `group`.
+
+    Simplicial normalisation (Lavoie et al. 2023; Hansen et al. 2024, TD-MPC2, equation 5).
+    """
+    return nn.softmax(z.reshape(*z.shape[:-1], -1, group)).reshape(z.shape)
 
 
 class Dense(nn.Module):
@@ -183,11 +233,12 @@ class ConvTranspose(nn.Module):
         kernel: side of the kernel, in pixels; its parameter is [kernel, kernel, C, features].
         stride: the factor by which the image grows.
         size: height and width of the output, in pixels; each less than `stride` above or below
-            `(h - 1) * stride + kernel`: what the mirrored layer saw, which may have left out the last rows
-            and columns (PyTorch's output padding: the bias alone is there) or have had zeros below them (they
-            are cut off).
+            `(h - 1) * stride + kernel`, less the padding: what the mirrored layer saw, which may have left
+            out the last rows and columns (PyTorch's output padding: the bias alone is there) or have had
+            zeros below them (they are cut off).
         initial: a key of `INITIALISERS`.
         init_scale: factor of the kernel's initial values.
+        padding: the zeros around the mirrored layer's input, which are cut off.
     """
 
     features: int
@@ -196,12 +247,13 @@ class ConvTranspose(nn.Module):
     size: tuple[int, int]
     initial: str = "pytorch"
     init_scale: float = 1.0
+    padding: Pads = ((0, 0), (0, 0))
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
         k, s, channels = self.kernel, self.stride, x.shape[-1]
-        for wanted, given in zip(self.size, x.shape[1:3], strict=True):
-            if not abs(wanted - ((given - 1) * s + k)) < s:
+        for wanted, given, pads in zip(self.size, x.shape[1:3], self.padding, strict=True):
+            if not abs(wanted - ((given - 1) * s + k - sum(pads))) < s:
                 raise ValueError(f"a kernel of {k} with stride {s} cannot make {wanted} pixels from {given}")
         fan_in = max(1, k // s) ** 2 * channels  # the inputs that reach an output pixel
         init, bias_init = INITIALISERS[self.initial](fan_in)
@@ -215,7 +267,8 @@ class ConvTranspose(nn.Module):
         batch, rows, columns, _ = x.shape
         x = x.reshape(batch, rows, columns, s, s, self.features).transpose(0, 1, 3, 2, 4, 5)
         x = x.reshape(batch, rows * s, columns * s, self.features)
-        return _fitted(x, self.size) + bias
+        (above, _), (left, _) = self.padding
+        return _fitted(x[:, above:, left:], self.size) + bias
 
 
 def factorised_noise(key: Array, size: int) -> Array:

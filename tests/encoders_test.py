@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import encoders
-from srl_jax.encoders.convolutional import Layer, layer_sides
+from srl_jax import encoders, specs
+from srl_jax.encoders.convolutional import Layer, layer_sides, padding_between
 from srl_jax.encoders.impala import doubled, halved
+from srl_jax.encoders.options import ENDS, End, Latent
+from srl_jax.layers import Conv, ConvTranspose, padding_of, sim_norm
 from srl_jax.window import to_unit
 from tests.helpers import STACK, count, identical, jit, random_params
 
@@ -24,6 +26,16 @@ from tests.helpers import STACK, count, identical, jit, random_params
         # 28,928 as above;  39,200 * 50 + 50 = 1,960,050;  LayerNorm 100.
         ("sac_ae", {"features": 50}, 50, 1_989_078),
         ("sac_ae", {"features": 50, "layer_norm": False}, 50, 1_988_978),
+        ("sac_ae", {"features": 50, "end": "tanh"}, 50, 1_988_978),
+        # Dopamine's: 84 -> 21 -> 11 -> 11 pixels, 11*11*64 numbers, the same kernels.
+        ("nature", {"padding": "same"}, 7744, 77_984),
+        # 64 + 64 numbers of LayerNorm behind the means of 64 maps, and behind a linear layer 10 + 10.
+        ("nature", {"pool": "average", "end": "layer_norm"}, 64, 77_984 + 128),
+        ("nature", {"pool": "average", "features": 10, "end": "layer_norm"}, 10, 77_984 + 650 + 20),
+        # 5*5*4*32 + 32 = 3,232;  5*5*32*64 + 64 = 51,264.  84 -> 16 -> 3 pixels: 3*3*64 numbers.
+        ("der", {}, 576, 54_496),
+        # 1,184 + 2 * 9,248 as above.  84 -> 41 -> 39 -> 37 pixels: 37*37*32 = 43,808 numbers.
+        ("a_lix", {}, 50, 1_184 + 2 * 9_248 + 43_808 * 50 + 50),
     ],
 )
 def test_parameter_counts_and_features_at_84_pixels(name, options, features, number):
@@ -52,10 +64,45 @@ def test_decoders_mirror_their_encoder(name, shape, extra):
     encoder_params = jax.eval_shape(encoder.init, jax.random.key(0))
     kernels = [x.shape for x in jax.tree.leaves(encoder_params) if len(x.shape) == 4]
     mirrored = [x.shape for x in jax.tree.leaves(params) if len(x.shape) == 4]
-    if name == "nature" and extra:  # without a bottleneck, the extra inputs are maps of the first layer
-        mirrored.remove((3, 3, 64 + extra, 64))
-        mirrored.append((3, 3, 64, 64))
+    if extra and name in ("nature", "der"):  # no bottleneck: the extra inputs are maps of the first layer
+        side, outputs = {"nature": (3, 64), "der": (5, 32)}[name]
+        mirrored.remove((side, side, 64 + extra, outputs))
+        mirrored.append((side, side, 64, outputs))
     assert sorted(kernels) == sorted((h, w, o, i) for h, w, i, o in mirrored)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [("nature", {"padding": "same"}), ("impala", {"features": 0})]
+    + [
+        (name, o)
+        for name in encoders.REGISTRY
+        for o in ({"pool": "average", "features": 0}, {"features": 16})
+    ],
+)
+@pytest.mark.parametrize("shape", [(84, 84, 4), (41, 73, 6)])
+def test_decoders_mirror_every_option(name, shape, options):
+    encoder = encoders.REGISTRY[name](shape, **options)
+    decoder = encoder.make_decoder(3)
+    z = jax.ShapeDtypeStruct((2, encoder.features + 3), jnp.float32)
+    image = jax.eval_shape(decoder.apply, jax.eval_shape(decoder.init, jax.random.key(0)), z)
+    assert image.shape == (2, *shape)
+    if "pool" in options:
+        assert encoder.features == encoder.map_shape[-1]
+
+
+def test_a_same_decoder_is_the_transposed_encoder():
+    # Of linear maps <A x, y> = <x, A^T y>. At 9 pixels a kernel of 4 and stride 2 has one zero above and two
+    # below (9 -> 5), which the transposed convolution has to cut off on the right sides.
+    padding = ((1, 2), (1, 2))
+    rng = np.random.default_rng(0)
+    kernel = rng.normal(size=(4, 4, 3, 2)).astype(np.float32)
+    x, y = (rng.normal(size=shape).astype(np.float32) for shape in ((1, 9, 9, 3), (1, 5, 5, 2)))
+    conv = Conv(2, 4, 2, padding="SAME").apply({"params": {"kernel": kernel, "bias": np.zeros(2)}}, x)
+    layer = ConvTranspose(3, 4, 2, (9, 9), padding=padding)
+    back = layer.apply({"params": {"kernel": kernel.transpose(0, 1, 3, 2), "bias": np.zeros(3)}}, y)
+    assert conv.shape == y.shape and back.shape == x.shape
+    assert float(jnp.sum(conv * y)) == pytest.approx(float(jnp.sum(x * back)), rel=1e-4)
 
 
 @pytest.mark.parametrize("name", ["nature", "tiny"])  # without and with a bottleneck
@@ -101,10 +148,92 @@ def test_latents_can_start_blind_to_a_uniform_background_and_see_a_ball():
         assert (np.mean((on > 0) & (on < 1)) > 0.5) == started
 
 
-@pytest.mark.parametrize("option", [{"init": "hee"}, {"gain": 0.0}, {"decoder_scale": 2e3}])
-def test_a_start_that_cannot_be_is_refused(option):
+@pytest.mark.parametrize(
+    "option",
+    [{"init": "hee"}, {"gain": 0.0}, {"decoder_scale": 2e3}, {"end": "softmax"}, {"pool": "max"}]
+    + [{"features": -1}, {"end": "sim_norm", "features": 12}],
+)
+def test_a_start_or_an_end_that_cannot_be_is_refused(option):
     with pytest.raises(ValueError, match=next(iter(option))):
         encoders.tiny((42, 42, STACK), **option)
+
+
+def test_options_of_one_row_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match="padding: did you mean same"):
+        encoders.nature((84, 84, 4), padding="SAME")
+    with pytest.raises(
+        ValueError, match="layer_norm=false is of the default end; leave it out beside end=tanh"
+    ):
+        encoders.sac_ae((84, 84, 4), layer_norm=False, end="tanh")
+
+
+class Ended(nn.Module):
+    """The latent of maps."""
+
+    latent: Latent
+
+    @nn.compact
+    def __call__(self, x):
+        return self.latent.encode(x)
+
+
+LATENTS = {
+    # Of 1, 3, 2, -4 and four zeros, which are one group of the softmax.
+    "none": [1, 3, 2, -4, 0, 0, 0, 0],
+    "relu": [1, 3, 2, 0, 0, 0, 0, 0],
+    "tanh": np.tanh([1, 3, 2, -4, 0, 0, 0, 0]),
+    "min_max": np.array([5, 7, 6, 0, 4, 4, 4, 4]) / 7,
+    "sim_norm": np.exp([1, 3, 2, -4, 0, 0, 0, 0]) / np.sum(np.exp([1, 3, 2, -4, 0, 0, 0, 0])),
+    # The mean is 0.25; the squares' is 30 / 8.
+    "layer_norm": (np.array([1, 3, 2, -4, 0, 0, 0, 0]) - 0.25) / np.sqrt(30 / 8 - 0.25**2 + 1e-5),
+}
+
+
+@pytest.mark.parametrize("end", ENDS)
+def test_ends_by_hand(end):
+    # One pixel of four maps: the linear layer passes them on, and four zeros.
+    latent = End(end).latent((1, 1, 4), 8)
+    params = {"Dense_0": {"kernel": np.eye(4, 8), "bias": np.zeros(8)}}
+    if "layer_norm" in ENDS[end]:
+        params["LayerNorm_0"] = {"scale": np.ones(8), "bias": np.zeros(8)}
+    wanted = np.tanh(LATENTS["layer_norm"]) if end == "layer_norm_tanh" else LATENTS[end]
+    z = Ended(latent).apply({"params": params}, np.array([1.0, 3, 2, -4]).reshape(1, 1, 1, 4))
+    np.testing.assert_allclose(z[0], wanted, atol=1e-5)
+
+
+def test_average_pooling_is_the_mean_of_each_map():
+    latent = End(pool="average").latent((2, 2, 3), 0)
+    maps = np.arange(12.0).reshape(1, 2, 2, 3)  # of the first map 0, 3, 6, 9
+    assert latent.size == 3 and Ended(latent).apply({}, maps).tolist() == [[4.5, 5.5, 6.5]]
+
+
+def test_groups_of_eight_are_shares_of_one():
+    z = np.random.default_rng(0).normal(size=(3, 24)).astype(np.float32)
+    shares = np.asarray(sim_norm(z, 8))
+    np.testing.assert_allclose(shares.reshape(3, 3, 8).sum(-1), 1, rtol=1e-6)
+    np.testing.assert_allclose(shares[1, 8:16], np.exp(z[1, 8:16]) / np.exp(z[1, 8:16]).sum(), rtol=1e-5)
+
+
+def test_the_default_end_is_the_papers_behind_a_linear_layer():
+    def last(name, **options):
+        steps = encoders.REGISTRY[name]((84, 84, 4), **options).steps
+        names = [step["step"] for step in steps]
+        return names[names.index("flatten") + 1 :]
+
+    assert last("nature") == last("der") == last("tiny", features=0) == last("sac_ae", features=0) == []
+    assert last("nature", features=9) == last("a_lix") == ["dense"]
+    assert last("sac_ae") == last("tiny") == ["dense", "layer_norm", "tanh"]
+    assert last("sac_ae", layer_norm=False) == ["dense", "tanh"]
+    assert last("sac_ae", features=0, end="tanh") == ["tanh"]
+
+
+def test_specifications_from_before_the_end_was_an_option_mean_the_same():
+    old = specs.parse("sac_ae:features=256,layer_norm=true,init=he", encoders.REGISTRY)
+    assert old.full == (
+        "sac_ae:features=256,layer_norm=true,init=he,zero_sum=false,gain=1.0,decoder_scale=1.0,"
+        "end=default,pool=none"
+    )
+    assert specs.parse(old.full, encoders.REGISTRY).resolved == old.resolved
 
 
 @pytest.mark.parametrize("layer_norm", [True, False])
@@ -119,7 +248,9 @@ def test_bottleneck_is_normalised_before_its_tanh(layer_norm):
     assert normal == layer_norm
 
 
-@pytest.mark.parametrize(("name", "least"), [("nature", 29), ("sac_ae", 14), ("tiny", 15)])
+@pytest.mark.parametrize(
+    ("name", "least"), [("nature", 29), ("sac_ae", 14), ("tiny", 15), ("der", 21), ("a_lix", 10)]
+)
 def test_frames_below_the_least_size_of_the_layers_are_refused(name, least):
     # nature needs 3 pixels for its last layer, so 5 for the one before and, with zeros below, 8 + 4 * 5 + 1.
     encoders.REGISTRY[name]((84, least, 4))
@@ -138,9 +269,22 @@ def test_sides_of_layers_by_hand():
     # The thesis' network sees 40 * 2 + 3 = 83 of 84, Catch's at 84 19 * 4 + 6 = 82.
     assert layer_sides(84, [Layer(32, 3, 2), Layer(32, 3, 1)]) == [84, 41, 39]
     assert layer_sides(84, [Layer(16, 6, 4), Layer(16, 4, 2)]) == [84, 20, 9]
+    # With zeros all around, sides are divided and rounded up, whatever the kernel.
+    assert layer_sides(84, layers, same=True) == [84, 21, 11, 11]
+    # DER's sees 5 * (5 * 2 + 4) + 5 = 75 of 84; of 64 it would see 50.
+    der = [Layer(32, 5, 5), Layer(64, 5, 5)]
+    assert layer_sides(84, der, least_seen=75 / 84) == [84, 16, 3]
+    assert layer_sides(64, der, least_seen=75 / 84) == [64, 13, 3]
 
 
-@pytest.mark.parametrize("name", encoders.REGISTRY.keys() - {"sac_ae"})  # which leaves out one row in 64
+def test_zeros_all_around_are_flaxs_same():
+    sizes = [(84, 41), (21, 11), (11, 6)]
+    for before, after, layer in zip(sizes, sizes[1:], [Layer(32, 8, 4), Layer(64, 4, 2)], strict=False):
+        expected = padding_of("SAME", before, layer.kernel, layer.stride)
+        assert padding_between(before, after, layer, centred=True) == expected
+
+
+@pytest.mark.parametrize("name", encoders.REGISTRY.keys() - {"sac_ae", "a_lix"})  # leave out 1 row in 64
 def test_every_pixel_of_an_odd_image_counts(name):
     shape = (64, 41, 3)
     encoder = encoders.REGISTRY[name](shape)
@@ -159,9 +303,11 @@ def test_impala_at_84_pixels():
     wider = encoders.impala((84, 84, 4), features=10, width=2)
     kernel = jax.eval_shape(wider.init, jax.random.key(0))["Conv_0"]["kernel"]
     assert wider.features == 10 and kernel.shape == (3, 3, 4, 32)
-    for option in ("features", "width"):
-        with pytest.raises(ValueError, match=option):
-            encoders.impala((84, 84, 4), **{option: 0})
+    with pytest.raises(ValueError, match="width"):
+        encoders.impala((84, 84, 4), width=0)
+    # BBF's has no linear layer: 128 maps of 11 x 11.
+    bbf = encoders.impala((84, 84, 4), width=4, features=0, end="min_max")
+    assert (bbf.features, bbf.map_shape) == (128 * 11 * 11, (11, 11, 128))
 
 
 @pytest.mark.parametrize(("height", "width"), [(4, 5), (7, 6), (1, 2)])
@@ -186,6 +332,7 @@ def test_doubling_by_hand():
 
 def test_where_a_map_is_flattened_its_shape_is_known():
     shapes = {"nature": (7, 7, 64), "sac_ae": (35, 35, 32), "tiny": (9, 9, 16), "impala": (11, 11, 32)}
+    shapes |= {"der": (3, 3, 64), "a_lix": (37, 37, 32)}
     assert {n: row((84, 84, 4)).map_shape for n, row in encoders.REGISTRY.items()} == shapes
     assert encoders.nature((64, 96, 4)).map_shape == (5, 8, 64)
 
@@ -247,13 +394,6 @@ def test_a_module_that_is_no_encoder_or_decoder_is_refused_by_name():
     encoder = encoders.flax_encoder(Flat(), Unflat((4, 6, 3)), shape)
     with pytest.raises(ValueError, match=r"Unflat must give images \[B, 6, 4, 3\], not \[B, 4, 6, 3\]"):
         encoder.make_decoder()
-
-
-def test_a_bottleneck_needs_features():
-    with pytest.raises(ValueError, match="features"):
-        encoders.sac_ae((84, 84, 4), features=0)
-    with pytest.raises(ValueError, match="features"):
-        encoders.tiny((42, 42, 4), features=-1)
 
 
 def test_tiny_without_a_bottleneck_gives_its_maps():

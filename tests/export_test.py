@@ -93,12 +93,24 @@ def computed(steps, arrays, x):
                 x = x * own["scale"] + own["bias"]
             case "tanh":
                 x = np.tanh(x)
+            case "average":
+                x = x.mean((1, 2))
+            case "min_max":
+                low, high = x.min(-1, keepdims=True), x.max(-1, keepdims=True)
+                x = (x - low) / np.maximum(high - low, step["least"])
+            case "sim_norm":
+                x = np.exp(x.reshape(len(x), -1, step["group"]))
+                x = (x / x.sum(-1, keepdims=True)).reshape(len(x), -1)
+            case other:
+                raise ValueError(other)
     return x
 
 
 @pytest.mark.parametrize(
     ("spec", "side"),
-    [("nature:gain=32", 84), ("sac_ae:features=5", 37), ("tiny", 45), ("tiny:features=0", 42)],
+    [("nature:gain=32", 84), ("sac_ae:features=5", 37), ("tiny", 45), ("tiny:features=0", 42)]
+    + [("der", 84), ("der:features=8,end=sim_norm", 41), ("der:end=min_max", 41), ("a_lix", 20)]
+    + [("nature:padding=same,pool=average,end=layer_norm", 42), ("tiny:end=relu", 42)],
 )
 def test_what_the_file_says_is_enough_to_run_the_encoder(tmp_path, spec, side):
     # At 37 and 45 pixels some strides do not fit, and zeros are added.

@@ -223,6 +223,26 @@ def test_he_normal_keeps_the_size_of_a_signal():
     assert abs(x.mean()) < 0.01 and 0.45 < np.abs(x).max() <= 0.4548
 
 
+def test_xavier_uniform_is_flaxs():
+    # 3 * 3 * 4 = 36 inputs and 3 * 3 * 20 = 180 outputs: b = sqrt(6 / 216) = 1/6.
+    x = np.asarray(layers.xavier_uniform(36)(jax.random.key(0), (3, 3, 4, 20)))
+    assert 0.16 < np.abs(x).max() <= 1 / 6
+    assert x.std() == pytest.approx(1 / 6 / np.sqrt(3), rel=0.1)
+    flaxs = jax.nn.initializers.xavier_uniform()(jax.random.key(0), (3, 3, 4, 20), np.float32)
+    np.testing.assert_allclose(x, flaxs, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("shape", [(3, 3, 4, 20), (2, 2, 3, 30)])  # more rows than columns, and fewer
+def test_orthogonal_kernels_are_orthogonal(shape):
+    inputs, outputs = int(np.prod(shape[:-1])), shape[-1]
+    x = np.asarray(layers.orthogonal(inputs)(jax.random.key(0), shape)).reshape(inputs, outputs)
+    product = x.T @ x if inputs > outputs else x @ x.T
+    np.testing.assert_allclose(product, 2 * np.eye(min(inputs, outputs)), atol=1e-5)
+    # Where a quarter of the inputs reaches an output, as through strides of 2, a signal keeps its size, too.
+    y = np.asarray(layers.orthogonal(inputs / 4)(jax.random.key(0), shape)).reshape(inputs, outputs)
+    np.testing.assert_allclose(y, 2 * x, rtol=1e-5, atol=1e-7)
+
+
 def test_every_layer_knows_its_fan_in(monkeypatch):
     fans = []
     record = lambda n: fans.append(n) or layers.zeros  # noqa: E731

@@ -11,7 +11,9 @@ from srl_jax.objectives.forward_pixels import ActionGate
 from srl_jax.objectives.reconstruction import (
     change_weights,
     corrupted,
+    largest_singular_value,
     shifted_stack,
+    spectrally_normalised,
     weighted_squared_error,
 )
 from srl_jax.optim import make_optimizer
@@ -85,6 +87,46 @@ def test_the_gradient_penalty_of_a_linear_decoder_is_its_kernels_size():
     ]
     expected = 2.0 * np.sum(np.asarray(head["kernel"]) ** 2) / (6 * 6 * 4)
     assert np.mean(rows) == pytest.approx(expected, rel=0.15)
+
+
+def test_a_largest_singular_value_and_its_gradient_by_hand():
+    # The columns' lengths are 5 and 1, and they are orthogonal: u = (0.6, 0.8, 0), v = (1, 0).
+    matrix = np.array([[3.0, 0.0], [4.0, 0.0], [0.0, 1.0]], np.float32)
+    value, gradient = jax.value_and_grad(largest_singular_value)(matrix)
+    assert float(value) == pytest.approx(5)
+    np.testing.assert_allclose(gradient, [[0.6, 0], [0.8, 0], [0, 0]], atol=1e-6)
+    # A matrix whose singular values lie close together is the worst case: they come out a little too small.
+    random = np.random.default_rng(0).normal(size=(40, 30)).astype(np.float32)
+    exact = np.linalg.svd(random, compute_uv=False)[0]
+    assert 0.85 * exact < float(largest_singular_value(random)) <= exact * (1 + 1e-6)
+
+
+def test_a_spectrally_normalised_decoder_has_kernels_of_size_one():
+    rng = np.random.default_rng(0)
+    params = {
+        "a": {"kernel": 9 * rng.normal(size=(2, 2, 3, 5)), "bias": np.full(5, 7.0)},
+        "b": np.zeros((2, 2)),
+    }
+    params = jax.tree.map(np.float32, params)
+    normal = spectrally_normalised(params)
+    sizes = np.linalg.svd(np.asarray(normal["a"]["kernel"]).reshape(12, 5), compute_uv=False)
+    assert (
+        sizes[0] == pytest.approx(1, rel=0.05)
+        and np.all(normal["a"]["bias"] == 7)
+        and np.all(normal["b"] == 0)
+    )
+
+    context, window = make_context(), make_window()
+    plain, bounded = (objectives.reconstruction(context, spectral_norm=n) for n in (False, True))
+    latents = latents_of(draw(1, BATCH, 8))
+    losses, head, _ = loss_of(bounded, latents, window)
+    same, _ = plain.loss(spectrally_normalised(head), None, latents, window, jax.random.key(0))
+    np.testing.assert_allclose(losses, same, rtol=1e-5)
+    # The kernel's size does not count, so its gradient has no share along the kernel.
+    gradient = jax.grad(lambda h: bounded.loss(h, None, latents, window, jax.random.key(0))[0].sum())(head)
+    along = np.sum(np.asarray(gradient["kernel"]) * head["kernel"])
+    length = np.linalg.norm(gradient["kernel"]) * np.linalg.norm(head["kernel"])
+    assert length > 0 and abs(along) < 1e-3 * length
 
 
 @pytest.mark.parametrize("action", ["joined", "multiplied"])

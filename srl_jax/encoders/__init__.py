@@ -1,64 +1,131 @@
 """The encoders: `REGISTRY[name](observation_shape, **options) -> Encoder`, a row each.
 
 `observation_shape` is (H, W, S * C), of any size from the least that the layers fit. Each comes with the
-decoder that mirrors it, and all have the options `init`, `zero_sum`, `gain` and `decoder_scale`: see
-`srl_jax.encoders.convolutional.Start`. `flax_encoder` makes an encoder of any flax module.
-`from_npz` loads one that `srl-jax export` has written.
+decoder that mirrors it, and all have the option `features` and those of `srl_jax.encoders.options.Start` and
+`End`. `flax_encoder` makes an encoder of any flax module. `from_npz` loads one that `srl-jax export` has
+written.
 """
 
 from srl_jax.encoders.adapter import flax_encoder
-from srl_jax.encoders.convolutional import Layer, Start, convolutional_encoder, starting
+from srl_jax.encoders.convolutional import Layer, convolutional_encoder
 from srl_jax.encoders.files import from_npz, to_npz
 from srl_jax.encoders.impala import impala
+from srl_jax.encoders.options import End, Start, with_options
 from srl_jax.plugins import Registry
-from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
-__all__ = ["REGISTRY", "register", "flax_encoder", "from_npz", "impala", "nature", "sac_ae", "tiny", "to_npz"]
+__all__ = [
+    "REGISTRY", "register", "flax_encoder", "from_npz", "to_npz",
+    "a_lix", "der", "impala", "nature", "sac_ae", "tiny",
+]  # fmt: skip
 
 
-@starting
-def nature(observation_shape: tuple[int, int, int], start: Start) -> Encoder:
+@with_options
+def nature(
+    observation_shape: tuple[int, int, int],
+    start: Start,
+    end: End,
+    *,
+    features: int = 0,
+    padding: str = "valid",
+) -> Encoder:
     """The encoder of Mnih et al. (2015): no bottleneck, 3,136 features at 84 x 84.
 
     Its decoder ends in a sigmoid, as in the thesis' code.
+
+    Args:
+        features: size of a linear layer; 0 for none.
+        padding: "valid"; or "same", zeros around every layer's input, 7,744 features at 84 x 84: what
+            Dopamine's JAX agents and those built on it run, flax's default.
+
+    Raises:
+        ValueError: where an option is out of range or the frames are too small.
     """
     layers = [Layer(32, 8, 4), Layer(64, 4, 2), Layer(64, 3, 1)]
-    return convolutional_encoder(observation_shape, layers, start, sigmoid=True)
+    return convolutional_encoder(
+        observation_shape, layers, start, end, features=features, sigmoid=True, padding=padding
+    )
 
 
-@starting
+@with_options
+def der(observation_shape: tuple[int, int, int], start: Start, end: End, *, features: int = 0) -> Encoder:
+    """The encoder of data-efficient Rainbow (van Hasselt et al. 2019, appendix E): 576 features at 84 x 84.
+
+    As published it has no padding, and at 84 x 84 it does not see the last 9 rows and columns. Sizes of which
+    it would see less have zeros below and on the right. Its decoder is linear at the end; the paper has none.
+
+    Args:
+        features: size of a linear layer; 0 for none.
+
+    Raises:
+        ValueError: where an option is out of range or the frames are too small.
+    """
+    layers = [Layer(32, 5, 5), Layer(64, 5, 5)]
+    return convolutional_encoder(observation_shape, layers, start, end, features=features, least_seen=75 / 84)
+
+
+@with_options
+def a_lix(observation_shape: tuple[int, int, int], start: Start, end: End, *, features: int = 50) -> Encoder:
+    """The encoder of A-LIX on Atari (Cetin et al. 2022, table 7), without its LIX layer.
+
+    The LIX layer, which mixes neighbouring pixels of the maps at random, is what the paper is about: this row
+    is the baseline below it. The authors have not published their Atari code; in their code for control
+    LayerNorm and tanh follow the linear layer, as `end=layer_norm_tanh` does.
+
+    Args:
+        features: size of the linear layer; 0 leaves it out.
+
+    Raises:
+        ValueError: where an option is out of range or the frames are too small.
+    """
+    layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1)]
+    return convolutional_encoder(observation_shape, layers, start, end, features=features)
+
+
+@with_options
 def sac_ae(
-    observation_shape: tuple[int, int, int], start: Start, *, features: int = 256, layer_norm: bool = True
+    observation_shape: tuple[int, int, int],
+    start: Start,
+    end: End,
+    *,
+    features: int = 256,
+    layer_norm: bool = True,
 ) -> Encoder:
     """The thesis' larger encoder, after SAC-AE (Yarats et al. 2021, appendix B.2).
 
     Args:
-        features: size of the bottleneck; the thesis has 50 and 256.
-        layer_norm: LayerNorm before the tanh (in the thesis' code, not in its text).
+        features: size of the bottleneck; the thesis has 50 and 256. 0 leaves it out.
+        layer_norm: LayerNorm before the tanh of the default end (in the thesis' code, not in its text).
 
     Raises:
-        ValueError: where features is out of range or the frames are too small.
+        ValueError: where an option is out of range or the frames are too small, or `layer_norm=false` is
+            beside another end.
     """
-    check_size("features", features)
+    if not layer_norm and end.end != "default":
+        raise ValueError(f"layer_norm=false is of the default end; leave it out beside end={end.end}")
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
-    return convolutional_encoder(observation_shape, layers, start, features=features, layer_norm=layer_norm)
+    own_end = "layer_norm_tanh" if layer_norm else "tanh"
+    return convolutional_encoder(observation_shape, layers, start, end, features=features, own_end=own_end)
 
 
-@starting
-def tiny(observation_shape: tuple[int, int, int], start: Start, *, features: int = 64) -> Encoder:
+@with_options
+def tiny(observation_shape: tuple[int, int, int], start: Start, end: End, *, features: int = 64) -> Encoder:
     """A small encoder for tests and for Catch: two convolutions and a bottleneck.
 
     Args:
-        features: size of the bottleneck; 0 leaves it out, as `nature` does.
+        features: size of the bottleneck, behind which the default end is LayerNorm and tanh; 0 leaves it out,
+            as `nature` does.
 
     Raises:
-        ValueError: where features is out of range or the frames are too small.
+        ValueError: where an option is out of range or the frames are too small.
     """
-    check_size("features", features, least=0)
     layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
-    return convolutional_encoder(observation_shape, layers, start, features=features)
+    own_end = "layer_norm_tanh"
+    return convolutional_encoder(observation_shape, layers, start, end, features=features, own_end=own_end)
 
 
-REGISTRY = Registry("encoders", {"nature": nature, "sac_ae": sac_ae, "tiny": tiny, "impala": impala})
+REGISTRY = Registry(
+    "encoders",
+    {"nature": nature, "der": der, "a_lix": a_lix, "sac_ae": sac_ae, "tiny": tiny, "impala": impala},
+)
 register = REGISTRY.register

@@ -26,9 +26,11 @@ def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec:
     `ABOUT` has "steps", where the encoder says them: what a program without this one has to compute of uint8
     [B, H, W, S * C], one after the other. "multiply" has the number "by"; "conv" has "stride" and "padding",
     zeros [[above, below], [left, right]], of a cross-correlation by `kernel` [height, width, in, out] plus
-    `bias`; "flatten" makes [B, D] in the order H, W, C; "dense" is x @ `kernel` + `bias`; "layer_norm" has
-    "epsilon", which is added to the variance, `scale` and `bias`; "relu" and "tanh" have nothing. A step's
-    "parameters" is what comes before the / of their names.
+    `bias`; "flatten" makes [B, D] in the order H, W, C, and "average" the means [B, C] over H and W; "dense"
+    is x @ `kernel` + `bias`; "layer_norm" has "epsilon", which is added to the variance, `scale` and `bias`;
+    "min_max" is (x - min) / max(max - min, "least"), of a row; "sim_norm" is the softmax of each "group"
+    neighbours in a row; "relu" and "tanh" have nothing. A step's "parameters" is what comes before the / of
+    their names.
 
     Args:
         path: of the file; what lies there is replaced, once the new one is whole.

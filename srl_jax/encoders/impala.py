@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from srl_jax.encoders.adapter import flax_encoder
-from srl_jax.encoders.convolutional import Start, starting
-from srl_jax.layers import Conv, Dense, WideDense
+from srl_jax.encoders.options import End, Latent, Start, with_options
+from srl_jax.layers import Conv
 from srl_jax.specs import check_size
 from srl_jax.types import Encoder
 
@@ -33,17 +33,17 @@ class Residual(nn.Module):
 
 
 class ImpalaEncoder(nn.Module):
-    """Stages of a convolution, a pooling that halves, and `Residual`; then ReLU, a linear layer, and ReLU.
+    """Stages of a convolution, a pooling that halves, and `Residual`; then ReLU, and what makes a latent.
 
     Attributes:
         channels: of the stages.
-        features: the latent's size.
         start: of the convolutions.
+        latent: of the last stage's maps.
     """
 
     channels: Sequence[int]
-    features: int
     start: Start
+    latent: Latent
 
     @nn.compact
     def __call__(self, observation: Array) -> Array:
@@ -54,8 +54,7 @@ class ImpalaEncoder(nn.Module):
             first = i == 0
             x = Conv(channels, 3, 1, initial, zero_sum and first, gain if first else 1.0, padding="SAME")(x)
             x = Residual(initial)(halved(x))
-        x = nn.relu(x).reshape(x.shape[0], -1)
-        return nn.relu(Dense(self.features)(x))
+        return self.latent.encode(nn.relu(x))
 
 
 class ImpalaDecoder(nn.Module):
@@ -63,20 +62,21 @@ class ImpalaDecoder(nn.Module):
 
     Attributes:
         channels: of the encoder's stages.
-        sizes: (height, width) of the image, and of each stage's output.
-        depth: the image's channels.
         start: the encoder's.
+        latent: the encoder's.
+        sizes: (height, width) of each stage's input in the encoder, image first.
+        depth: the image's channels.
     """
 
     channels: Sequence[int]
+    start: Start
+    latent: Latent
     sizes: Sequence[tuple[int, int]]
     depth: int
-    start: Start
 
     @nn.compact
     def __call__(self, z: Array) -> Array:
-        maps = *self.sizes[-1], self.channels[-1]
-        x = nn.relu(WideDense(maps[0] * maps[1] * maps[2])(z)).reshape(-1, *maps)
+        x = self.latent.decode(z)
         outputs = self.depth, *self.channels[:-1]
         for i in reversed(range(len(outputs))):
             x = doubled(nn.relu(Residual(self.start.init)(x)), self.sizes[i])
@@ -114,28 +114,29 @@ def doubled(x: Array, size: tuple[int, int]) -> Array:
     return x.reshape(batch, 2 * height, 2 * width, channels)[:, : size[0], : size[1]]
 
 
-@starting
+@with_options
 def impala(
-    observation_shape: tuple[int, int, int], start: Start, *, features: int = 256, width: int = 1
+    observation_shape: tuple[int, int, int], start: Start, end: End, *, features: int = 256, width: int = 1
 ) -> Encoder:
     """IMPALA's larger encoder: 15 convolutions of 3 x 3 and a linear layer; for frames of any size.
 
-    Its decoder is linear at the end. The paper has none.
+    Its decoder is linear at the end. The paper has none. `width=4,features=0,end=min_max` is the encoder of
+    BBF (Schwarzer et al. 2023).
 
     Args:
-        features: size of the latent, whose numbers are not negative.
+        features: size of the linear layer, behind which the default end is ReLU; 0 leaves it out.
         width: factor of the paper's 16, 32 and 32 channels.
 
     Raises:
         ValueError: where an option is out of range.
     """
-    check_size("features", features)
     check_size("width", width)
     rows, columns, depth = observation_shape
     channels, sizes = tuple(width * n for n in CHANNELS), [(rows, columns)]
     for _ in channels:
         rows, columns = -(-rows // 2), -(-columns // 2)
         sizes.append((rows, columns))
-    network = ImpalaEncoder(channels, features, start)
-    decoder = ImpalaDecoder(channels, tuple(sizes), depth, start)
-    return flax_encoder(network, decoder, observation_shape, map_shape=(*sizes[-1], channels[-1]))
+    latent = end.latent((*sizes[-1], channels[-1]), features, "relu")
+    network = ImpalaEncoder(channels, start, latent)
+    decoder = ImpalaDecoder(channels, start, latent, tuple(sizes[:-1]), depth)
+    return flax_encoder(network, decoder, observation_shape, map_shape=latent.map_shape)

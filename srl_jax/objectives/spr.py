@@ -4,19 +4,13 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from srl_jax.layers import Conv, Dense
+from srl_jax.layers import Conv, Dense, min_max
 from srl_jax.objectives.networks import cosine_distance, functions, one_hot
 from srl_jax.specs import check_choice, check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.update import ema
 
 TARGETS = ("slow", "stopped")
-
-
-def min_max(z: Array) -> Array:
-    """One latent moved and scaled into [0, 1], a constant to 0: float32 [D] -> float32 [D] (SPR's code)."""
-    low = jnp.min(z)
-    return (z - low) / jnp.maximum(jnp.max(z) - low, 1e-5)
 
 
 class Transition(nn.Module):
@@ -38,7 +32,7 @@ class Transition(nn.Module):
         x = jnp.concatenate([z.reshape(-1, *self.shape), planes], -1)
         x = nn.relu(Conv(channels, side, 1, padding="SAME", name="first")(x))
         x = Conv(channels, side, 1, padding="SAME", name="second")(x)
-        return jax.vmap(min_max)(x.reshape(z.shape))
+        return min_max(x.reshape(z.shape))
 
 
 def spr(
@@ -94,12 +88,12 @@ def spr(
         ahead = [k + 1 for k in range(steps)]
         behind = (latents.slow(ahead), slow_head) if target == "slow" else (latents.online(ahead), head)
         targets, below = jax.lax.stop_gradient(behind)
-        z: Array = jax.vmap(min_max)(latents.online(0))
+        z: Array = min_max(latents.online(0))
         losses: Array = jnp.zeros(len(z))
         for k in range(steps):
             z = transition(head["transition"], z, one_hot(window.actions[:, k], context.num_actions))
             prediction = predict(head["predictor"], project(head["projection"], z))
-            wanted = project(below["projection"], jax.vmap(min_max)(targets[k]))
+            wanted = project(below["projection"], min_max(targets[k]))
             counts = window.valid[:, k] if mask else 1.0
             losses += counts * jax.vmap(cosine_distance)(prediction, wanted)
         return losses / steps * (window.weight if importance else 1.0), {}
