@@ -8,6 +8,7 @@ from srl_jax.specs import Spec, parse_value, value_text
 
 if TYPE_CHECKING:
     from srl_jax.config import Config
+    from srl_jax.modes import Mode
 
 
 class Anneal(NamedTuple):
@@ -66,11 +67,13 @@ def parse(text: str, kind: type) -> Anneal:
     return found
 
 
-def check(config: "Config") -> None:
+def check(config: "Config", mode: "Mode") -> None:
     """Raises ConfigError, a line that names the flag, where those of annealing and resets do not fit."""
     for name, kind in (("n_anneal", int), ("gamma_anneal", float)):
         if not (text := getattr(config, name)):
             continue
+        if not mode.rl:
+            raise ConfigError(f"--{name}={text}: --mode={mode.name} trains no RL")
         try:
             end = parse(text, kind).end
         except ValueError as error:
@@ -88,6 +91,11 @@ def check(config: "Config") -> None:
     elif 0 < config.reset_last < config.reset_every:
         every = f"--reset_every={config.reset_every}"
         raise ConfigError(f"--reset_last={config.reset_last}: is before the first reset, see {every}")
+    elif not mode.rl:
+        raise ConfigError(f"--reset={config.reset}: --mode={mode.name} trains no RL, whose heads are reset")
+    elif config.reset == "all" and not (mode.rl_trains_encoder or mode.representation_trains_encoder):
+        never = f"--mode={mode.name} never moves the encoder, which that shrinks"
+        raise ConfigError(f"--reset=all: {never}; give --reset=head")
     if config.reset != "all" and config.shrink != type(config).shrink:
         raise ConfigError(
             f"--shrink={config.shrink}: --reset={config.reset} shrinks nothing; --reset=all does"

@@ -275,7 +275,6 @@ class Config:
             if getattr(self, name) > self.buffer_size:
                 value = f"--{name}={getattr(self, name)}"
                 raise ConfigError(f"{value}: must be at most --buffer_size={self.buffer_size}")
-        annealing.check(self)
 
     def to_json(self) -> str:
         """The fields as an indented JSON object; `from_json` gives this Config again, exactly."""

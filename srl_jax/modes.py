@@ -5,6 +5,7 @@ A mode is a row of `MODES`; the thesis' hypothesis 1 compares them.
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from srl_jax import annealing
 from srl_jax.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -134,15 +135,7 @@ def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", comp
             f"--policy_from={config.policy_from}: only --mode=pretrain reads it; "
             f"--mode={mode.name} acts with the policy that it learns"
         )
-    for name in ("n_anneal", "gamma_anneal"):
-        if getattr(config, name) and not mode.rl:
-            raise ConfigError(f"--{name}={getattr(config, name)}: --mode={mode.name} trains no RL")
-    if config.reset != "none" and not mode.rl:
-        raise ConfigError(f"--reset={config.reset}: --mode={mode.name} trains no RL, whose heads are reset")
-    if config.reset == "all" and not (mode.rl_trains_encoder or mode.representation_trains_encoder):
-        raise ConfigError(
-            f"--reset=all: --mode={mode.name} never moves the encoder, which that shrinks; give --reset=head"
-        )
+    annealing.check(config, mode)
     if config.augment == "srl" and not mode.representation:
         raise ConfigError(
             f"--augment=srl: --mode={mode.name} runs no representation loss; valid here: none, all"
