@@ -22,7 +22,8 @@ from tests.helpers import fill, identical, make_context, make_encoder
 
 BBF = dict(
     steps=100_000, num_envs=1, learn_start=2_000, updates_per_step=2.0, rl="rainbow:n_step=10", gamma=0.997,
-    gamma_anneal="0.97->0.997@10000", n_anneal="10->3@10000", reset="all", reset_every=20_000, reset_last=80_000,
+    gamma_anneal="0.97->0.997@10000", n_anneal="10->3@10000", reset="all", reset_every=20_000,
+    reset_last=80_000,
 )  # fmt: skip
 SR_SPR = dict(
     steps=100_000, num_envs=1, learn_start=2_000, updates_per_step=8.0, rl="rainbow:n_step=10", reset="all",
@@ -95,9 +96,8 @@ def test_a_share_of_1_leaves_the_encoder(states):
 
 def test_several_seeds_are_reset_as_each_alone(states):
     before, fresh = (state._replace(key=np.int32(0)) for state in states)
-    both = [
-        partial(jax.tree.map, lambda *x: jnp.stack(x))(*pair) for pair in ((before, fresh), (fresh, before))
-    ]
+    stacked = partial(jax.tree.map, lambda *x: jnp.stack(x))
+    both = stacked(before, fresh), stacked(fresh, before)
     alone = [reset(before, fresh, "all", 0.3), reset(fresh, before, "all", 0.3)]
     together = reset(*both, "all", 0.3)
     for i, state in enumerate(alone):
@@ -180,7 +180,7 @@ def test_without_flags_rows_and_windows_have_nothing_new():
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"n_anneal": "10-"}, "--n_anneal=10-: not start->end@updates, in quotes for the shell: '10->3@10000'"),
+        ({"n_anneal": "10-"}, "10-: not start->end@updates, in quotes for the shell: '10->3@10000'"),
         ({"n_anneal": "10->2.5@5"}, "--n_anneal=10->2.5@5: not start->end@updates"),
         ({"n_anneal": "10->0@5"}, "--n_anneal=10->0@5: 0 must be a whole number from 1"),
         ({"n_anneal": "10->3@0"}, "--n_anneal=10->3@0: must be annealed over at least 1 update"),
@@ -192,8 +192,8 @@ def test_without_flags_rows_and_windows_have_nothing_new():
         ({"reset_last": 5}, "--reset_last=5: --reset=none resets nothing"),
         ({"reset": "head", "reset_every": 9, "reset_last": 8}, "--reset_last=8: is before the first reset"),
         ({"reset": "head", "reset_every": 9, "shrink": 0.1}, "--shrink=0.1: --reset=head shrinks nothing"),
-        ({"reset": "head", "reset_every": 9, "mode": "pretrain"}, "--reset=head: --mode=pretrain trains no RL"),
-        ({"reset": "all", "reset_every": 9, "mode": "frozen"}, "--reset=all: --mode=frozen never moves the encoder"),
+        ({"reset": "all", "reset_every": 9, "mode": "pretrain"}, "--mode=pretrain trains no RL, whose heads"),
+        ({"reset": "all", "reset_every": 9, "mode": "frozen"}, "--mode=frozen never moves the encoder"),
     ],
     ids=str,
 )  # fmt: skip
