@@ -121,7 +121,7 @@ def test_bbfs_schedule_of_100_000_steps():
     steps = range(100_001)
     counts = [schedules.resets(step) for step in steps]
     assert [i for i in steps if i and counts[i] > counts[i - 1]] == [20_000, 40_000, 60_000, 80_000]
-    # Two updates a step from 2,000 on; n and gamma are those of NumPy's geometric series, after each reset anew.
+    # Two updates a step from 2,000 on; n and gamma are those of NumPy's geometric series, from each reset on.
     n = np.round(np.geomspace(10, 3, 10_001))
     gamma = 1 - np.geomspace(0.03, 0.003, 10_001)
     for step in range(2_000, 100_000, 37):
