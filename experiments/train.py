@@ -199,6 +199,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
 
     from srl_jax.files import checkpoint
     from srl_jax.run import loop
+    from srl_jax.run.schedules import printed
 
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
@@ -213,6 +214,9 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     config_flags.say_what_is_replaced(values)
     if dry:
         display.result(config.to_json())
+        if config.reset != "none" or config.n_anneal or config.gamma_anneal:
+            for line in printed(config, every=max(1, config.steps // 20)):
+                display.say(line)
         for (directory, _), manifest in zip(runs, manifests, strict=True):
             how = f"would resume from {manifest.env_steps} env steps" if manifest else "would begin"
             display.say(f"dry run: nothing is written; a run {how} in {directory}")

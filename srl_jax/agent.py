@@ -184,6 +184,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
     optimizer = make_optimizer(
         terms,
         decoder_weight_decay=config.decoder_weight_decay,
+        weight_decay=config.weight_decay,
         max_grad_norm=config.max_grad_norm,
         adam_eps=config.adam_eps,
     )

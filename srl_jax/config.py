@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from srl_jax import envs, modes, specs
+from srl_jax import annealing, envs, modes, specs
 from srl_jax.errors import ConfigError
 from srl_jax.files import provenance
 from srl_jax.files.reading import parse_json, read_json, replace_text
@@ -106,6 +106,27 @@ class Config:
     )
     learn_start: int = _steps(320, "env steps before the first update", minimum=0)
     gamma: float = _share(0.99, "discount", "per env step")
+    gamma_anneal: str = _value(
+        str, "",
+        "'0.97->0.997@10000': over so many updates after each reset, or the start, 1 - gamma goes "
+        "exponentially to that of --gamma; empty: gamma stays",
+    )  # fmt: skip
+    n_anneal: str = _value(
+        str, "",
+        "'10->3@10000': likewise n, rounded, of which the larger is --rl's n_step; empty: n stays",
+    )  # fmt: skip
+    reset: str = _value(
+        str, "none",
+        "what is drawn anew in the course of the run, with its slow copies and Adam's moments; head: RL's "
+        "head; all: all heads, and the encoder and SPR's transition are shrunk",
+        choices=("none", "head", "all"),
+    )  # fmt: skip
+    reset_every: int = _steps(0, "env steps between two resets", minimum=0)
+    reset_last: int = _steps(0, "env step after which there is no reset; 0: they go on", minimum=0)
+    shrink: float = _share(
+        0.5, "share of encoder and transition that --reset=all leaves, beside fresh parameters; 1 leaves all",
+        "share",
+    )  # fmt: skip
 
     lr_rl: float = _value(float, 1e-4, "Adam's learning rate of the RL head", minimum=0)
     lr_srl: float = _value(float, 1e-4, "Adam's learning rate of the representation heads", minimum=0)
@@ -125,6 +146,11 @@ class Config:
     decoder_weight_decay: float = _value(
         float, 1e-7, "L2 weight decay of the decoders, added before Adam's scaling", minimum=0
     )
+    weight_decay: float = _value(
+        float, 0.0,
+        "AdamW's decoupled weight decay of all that is trained and has more than one axis, per learning rate",
+        minimum=0,
+    )  # fmt: skip
     max_grad_norm: float = _value(
         float, 0.0, "global norm that gradients are clipped to; 0: no clipping", minimum=0
     )
@@ -340,6 +366,8 @@ def resolve(
     rl = specs.parse(config.rl, rl_registry, "rl")
     encoder = specs.parse(config.encoder, encoder_registry, "encoder")
     objectives = [specs.parse(text, objective_registry, "objective") for text in config.objectives]
+    if config.n_anneal:
+        annealing.check_n(config.n_anneal, rl)
     names = [objective.name for objective in objectives]
     for objective in objectives:
         if names.count(objective.name) > 1:

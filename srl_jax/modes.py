@@ -5,6 +5,7 @@ A mode is a row of `MODES`; the thesis' hypothesis 1 compares them.
 
 from typing import TYPE_CHECKING, NamedTuple
 
+from srl_jax import annealing
 from srl_jax.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -134,6 +135,7 @@ def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", comp
             f"--policy_from={config.policy_from}: only --mode=pretrain reads it; "
             f"--mode={mode.name} acts with the policy that it learns"
         )
+    annealing.check(config, mode)
     if config.augment == "srl" and not mode.representation:
         raise ConfigError(
             f"--augment=srl: --mode={mode.name} runs no representation loss; valid here: none, all"

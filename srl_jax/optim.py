@@ -38,17 +38,21 @@ def make_optimizer(
     objectives: dict[str, Objective],
     *,
     decoder_weight_decay: float = 0.0,
+    weight_decay: float = 0.0,
     max_grad_norm: float = 0.0,
     adam_eps: float = 1e-8,
 ) -> Optimizer:
     """The optimizer of a weighted sum of losses.
 
     Decoder weight decay is added to the gradient before Adam scales it, as PyTorch's Adam does and hence
-    SAC-AE (Yarats et al. 2021) and the thesis; it is not part of any loss.
+    SAC-AE (Yarats et al. 2021) and the thesis; it is not part of any loss. `weight_decay` is AdamW's
+    (Loshchilov and Hutter 2019, algorithm 2), which Adam does not scale: each step takes
+    `learning rate * weight_decay` of a parameter away. Biases and scales, which have one axis, do not decay.
 
     Args:
         objectives: by name; those with `is_decoder` decay.
         decoder_weight_decay: the factor of a decoder's parameters in its gradient.
+        weight_decay: the share per learning rate, of every group that moves.
         max_grad_norm: the global norm that gradients are clipped to; 0 for no clipping.
         adam_eps: Adam's epsilon.
     """
@@ -69,6 +73,8 @@ def make_optimizer(
             if group in decays:
                 gradient = jax.tree.map(lambda g, p: g + decoder_weight_decay * p, gradient, tree)
             steps, new_state[group] = adam.update(gradient, state[group])
+            if weight_decay:
+                steps = jax.tree.map(lambda u, p: u + weight_decay * p if p.ndim > 1 else u, steps, tree)
             rate = learning_rates[group]
             moved[group] = jax.tree.map(lambda p, u: p - rate * u, tree, steps)  # noqa: B023
         return moved, new_state, norms

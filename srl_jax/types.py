@@ -43,6 +43,7 @@ class Window(NamedTuple):
         valid: float32 [B, K]; 1 while s_{t+k+1} belongs to the same episode as s_t, then 0 for good.
             The final observation of an episode belongs to it. `valid[:, 0]` is always 1.
         weight: float32 [B]; importance weights, divided by the batch's maximum.
+        n_step: int32 [B]; n of RL's return where that is annealed, at most K; None: as RL itself says.
     """
 
     frames: Array
@@ -51,6 +52,7 @@ class Window(NamedTuple):
     discounts: Array
     valid: Array
     weight: Array
+    n_step: Array | None = None
 
 
 class Encoder(NamedTuple):

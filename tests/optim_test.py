@@ -1,7 +1,10 @@
 """srl_jax/optim.py against PyTorch's Adam written out in numpy."""
 
+from functools import partial
+
 import jax
 import numpy as np
+import optax
 import pytest
 
 from srl_jax.optim import NOT_MEASURED, make_optimizer, real_copy
@@ -126,3 +129,18 @@ def test_real_copy_survives_the_donation_of_its_original():
     assert params["kernel"].is_deleted()
     np.testing.assert_array_equal(copy["kernel"], np.ones((3, 2)))
     assert float(jax.random.uniform(copy["key"])) == float(jax.random.uniform(jax.random.key(0)))
+
+
+def test_decoupled_decay_is_optax_adamws_but_for_what_has_one_axis():
+    rng = np.random.default_rng(0)
+    draws = [{"kernel": rng.normal(size=(3, 2)), "bias": rng.normal(size=2)} for _ in range(4)]
+    params, *gradients = jax.tree.map(np.float32, draws)
+    ours = make_optimizer({}, weight_decay=0.3)
+    theirs = optax.adamw(0.01, weight_decay=0.3, mask=lambda tree: jax.tree.map(lambda x: x.ndim != 1, tree))
+    moved, expected = {"rl": params}, params
+    state, their_state, update = ours.init(moved), theirs.init(expected), jit(ours.update)
+    for gradient in gradients:
+        moved, state, _ = update({"rl": gradient}, state, moved, {"rl": 0.01})
+        steps, their_state = theirs.update(gradient, their_state, expected)
+        expected = optax.apply_updates(expected, steps)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-5, atol=1e-7), moved["rl"], expected)

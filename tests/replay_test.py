@@ -409,3 +409,16 @@ def test_memory_of_a_slot():
     assert replay.frames.nbytes == 100_000 * 7056
     values = [*vars(replay).values(), *vars(replay.tree).values()]
     assert sum(x.nbytes for x in values if isinstance(x, np.ndarray)) <= 100_000 * 7200
+
+
+def test_gamma_and_n_of_one_batch():
+    replay, same = (filled(num_streams=2, stack=4, horizon=3, seed=3).replay for _ in range(2))
+    window, indices = replay.sample(40, 0.4, gamma=0.25, n_step=2)
+    plain, same_indices = same.sample(40, 0.4)
+    np.testing.assert_array_equal(indices, same_indices)
+    assert plain.n_step is None and window.n_step.dtype == np.int32
+    np.testing.assert_array_equal(window.n_step, np.full(40, 2))
+    np.testing.assert_array_equal(window.discounts, np.where(plain.discounts, np.float32(0.25), 0))
+    assert (
+        window.discounts.max() == 0.25 and replay.sample(9, 0.4)[0].discounts.max() == plain.discounts.max()
+    )

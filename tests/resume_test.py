@@ -28,6 +28,9 @@ MODES = {
     "joint": {
         "mode": "joint", "objectives": ("inverse", "reconstruction"), "srl_every": 2,
         "game": "CatchDistractor", "diagnostics": True, "diagnostics_kept": 2,
+        # Resets after 52, where there is a checkpoint, 104 and 156; then n falls over 4 of 6 or 7 updates.
+        "reset": "all", "reset_every": 52, "n_anneal": "3->1@4", "gamma_anneal": "0.9->0.99@4",
+        "weight_decay": 0.1,
     },
     "pretrain": {"mode": "pretrain", "objectives": ("inverse",), "diagnostics": True},
 }  # fmt: skip

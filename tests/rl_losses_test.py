@@ -275,6 +275,22 @@ def test_n_step_is_the_slow_one(steps, truncated, n):
         assert int(offset) == expected_offset
 
 
+_annealed_n_step = jit(n_step)
+
+
+@given(
+    st.lists(st.tuples(st.integers(-3, 3), st.sampled_from([False] * 5 + [True])), min_size=1, max_size=7),
+    st.booleans(),
+    st.integers(1, HORIZON),
+)
+def test_n_that_is_known_when_it_runs_is_n(steps, truncated, n):
+    window = window_of(steps, truncated)
+    annealed = _annealed_n_step(*(np.stack([x, x]) for x in window), np.array([n, HORIZON], np.int32))
+    for i, fixed in enumerate((_n_step[n - 1](*window), _n_step[-1](*window))):
+        for ours, theirs in zip(annealed, fixed, strict=True):
+            assert ours[i] == theirs
+
+
 def test_n_step_by_hand():
     # gamma 0.5, n = 3, rewards 1, 2, 4.
     rewards = np.array([[1, 2, 4, 8], [1, 2, 4, 8], [1, 2, 0, 0]], np.float32)

@@ -102,7 +102,7 @@ class Updates:
         state = state._replace(params=_jittered(state.params, 1), slow=_jittered(state.slow, 2))
         given = {
             "params": flatten_dict(jax.device_get({"params": state.params, "slow": state.slow}), sep="/"),
-            "window": self.windows[0]._asdict(),
+            "window": {name: x for name, x in self.windows[0]._asdict().items() if x is not None},
         }
         # Not the timed update: what is traced here has no noise in it.
         config = dataclasses.replace(self.config, adam_eps=CHECK_ADAM_EPS)

@@ -15,12 +15,14 @@ from ..presets import PIECES, PIECES_HELP, PRESETS, summary
 GROUPS: dict[str, str] = {
     "Run": "preset config mode steps seed seeds import",
     "Game": "game num_envs frame_size frame_stack reward_clip life_loss sticky_actions noop_max",
-    "RL": "rl gamma target_encoder slow_update_every eps_train eps_final eps_anneal_steps",
+    "RL": "rl gamma gamma_anneal n_anneal target_encoder slow_update_every eps_train eps_final "
+    "eps_anneal_steps",
+    "Resets": "reset reset_every reset_last shrink",
     "Encoder": "encoder encoder_from heads_from",
     "Representation": "objective augment srl_every encoder_optimizer policy_from pretrain_epsilon",
     "Replay": "buffer_size batch_size updates_per_step learn_start beta beta_final beta_anneal_steps",
     "Optimisation": "lr_rl lr_srl lr_encoder lr_encoder_srl lr_final_share decoder_weight_decay "
-    "max_grad_norm adam_eps",
+    "weight_decay max_grad_norm adam_eps",
     "Evaluation": "eval_every eval_games eval_max_steps eps_eval stop_at_return diagnostics diagnostics_kept",
     "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every keep_best keep_replay "
     "logger print_config dry_run tune_runtime",

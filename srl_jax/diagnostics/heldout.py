@@ -128,6 +128,6 @@ def _collect(
         np.array(of_episode),
         env.state_problem,
     )
-    for array in map(np.asarray, (*held_out.windows, held_out.states, held_out.episodes)):
+    for array in map(np.asarray, (*held_out.windows[:-1], held_out.states, held_out.episodes)):
         array.setflags(write=False)
     return held_out

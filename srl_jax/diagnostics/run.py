@@ -76,7 +76,7 @@ class Diagnostics:
         return held_out
 
     def measure(
-        self, state: TrainState, env_steps: int, replay: Replay, beta: float, hyper: Hyper
+        self, state: TrainState, env_steps: int, replay: Replay, beta: float, hyper: Hyper, **of_rl: Any
     ) -> dict[str, float | None | list]:
         """The values of an "eval" row, JSON's own, and seconds as `wall_diag_s`; changes nothing of the run.
 
@@ -88,11 +88,12 @@ class Diagnostics:
             replay: of the run; a batch for gradients is drawn from it with a generator of its own.
             beta: the importance weights' exponent, now.
             hyper: of its next update.
+            **of_rl: of the windows, see `Replay.sample`.
         """
         began, window = time.perf_counter(), None
         if self._functions.conflict is not None and len(replay):
             rng = np.random.default_rng(seed_for(self._config.seed, "diagnostics", env_steps))
-            window, _ = replay.sample(self._config.batch_size, beta, rng)
+            window, _ = replay.sample(self._config.batch_size, beta, rng, **of_rl)
         values = self._measure(state, env_steps, window, hyper)
         plain = {f"diag/{name}": _plain(value) for name, value in values.items()}
         return plain | {"wall_diag_s": round(time.perf_counter() - began, 3)}
@@ -224,4 +225,4 @@ def _parts(number: int) -> list[slice]:
 
 
 def _rows(window: Window, rows: slice) -> Window:
-    return Window(*(x[rows] for x in window))
+    return jax.tree.map(lambda x: x[rows], window)

@@ -209,7 +209,13 @@ class Replay:
         self.num_transitions += self.num_streams
 
     def sample(
-        self, batch_size: int, beta: float, rng: np.random.Generator | None = None
+        self,
+        batch_size: int,
+        beta: float,
+        rng: np.random.Generator | None = None,
+        *,
+        gamma: float | None = None,
+        n_step: int | None = None,
     ) -> tuple[Window, np.ndarray]:
         """Draws windows in proportion to their priorities, stratified.
 
@@ -218,6 +224,8 @@ class Replay:
             beta: exponent of the importance weights (N_sampleable * p_i / sum p) ** -beta, divided by the
                 batch's largest.
             rng: draws in place of the replay's own, which is then left as it is.
+            gamma: in place of the replay's own.
+            n_step: every row's n of RL's return; None: the window has none.
 
         Returns:
             The Window, of arrays that nothing else refers to, and int64 [B] indices, one a row, for
@@ -233,7 +241,9 @@ class Replay:
         # The number of transitions and the sum of priorities cancel when divided by the largest weight.
         weight = ((priority.min() / priority) ** beta).astype(np.float32)
         streams, positions = self._locate(leaves)
-        window = self._window(streams, positions, weight)
+        window = self._window(streams, positions, weight, self.gamma if gamma is None else gamma)
+        if n_step is not None:
+            window = window._replace(n_step=np.full(batch_size, n_step, np.int32))
         return window, positions * self.num_streams + streams
 
     def sampleable(self) -> np.ndarray:
@@ -251,7 +261,7 @@ class Replay:
         if not self._find(indices)[1].all():
             raise ValueError("an index is not sampleable (any more)")
         positions, streams = np.divmod(indices, self.num_streams)
-        return self._window(streams, positions, np.ones(len(indices), np.float32))
+        return self._window(streams, positions, np.ones(len(indices), np.float32), self.gamma)
 
     def set_priorities(self, indices: np.ndarray, td_errors: np.ndarray) -> None:
         """Sets priorities to (|td_error| + 1e-6) ** alpha.
@@ -389,7 +399,7 @@ class Replay:
         values[len(closed) :] = self.max_priority
         self.tree.put(np.concatenate((closed, opened)), values)
 
-    def _window(self, streams, positions, weight):
+    def _window(self, streams, positions, weight, gamma):
         """The Window of sampleable positions: see types.Window."""
         base = (streams * self.slots)[:, None]
         steps = base + (positions[:, None] + self._steps) % self.slots
@@ -406,10 +416,10 @@ class Replay:
             goes_on = valid & ((flags & _TERMINAL) == 0)
             times = np.minimum(times, (positions + np.add.reduce(valid, axis=1))[:, None])
             actions, rewards = np.where(valid, actions, np.int32(0)), np.where(valid, rewards, np.float32(0))
-            discounts = np.where(goes_on, np.float32(self.gamma), np.float32(0))
+            discounts = np.where(goes_on, np.float32(gamma), np.float32(0))
             valid = valid.astype(np.float32)
         else:
-            discounts = np.full(steps.shape, self.gamma, np.float32)
+            discounts = np.full(steps.shape, gamma, np.float32)
             valid = np.ones(steps.shape, np.float32)
         frames = self._flat(self.frames).take(base + times % self.slots, axis=0)
         return Window(frames, actions, rewards, discounts, valid, weight)

@@ -87,7 +87,8 @@ def q_learner(
         return values.expected(apply(head, latents, noise))
 
     def loss(head, slow_head, latents: Latents, window: Window, key):
-        r_t, discount_t, offset = n_step_view(window.rewards, window.discounts, window.valid, n_step)
+        n = n_step if window.n_step is None else window.n_step
+        r_t, discount_t, offset = n_step_view(window.rewards, window.discounts, window.valid, n)
         a_tm1 = window.actions[:, 0]
         # The online network has one draw of noise for both observations, and so the same weights.
         online, slow = network.draw_noise(key, 2, context.features) if noisy else (None, None)

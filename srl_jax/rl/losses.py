@@ -152,7 +152,9 @@ def categorical_projection(support: Array, probs: Array, atoms: Array) -> jax.Ar
     return jnp.clip(1.0 - distance, 0.0, 1.0) @ probs
 
 
-def n_step(rewards: Array, discounts: Array, valid: Array, n: int) -> tuple[jax.Array, jax.Array, jax.Array]:
+def n_step(
+    rewards: Array, discounts: Array, valid: Array, n: int | Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The n-step view of a window: what the return is, and where and with what discount to bootstrap.
 
     Sums rewards until n steps are done, a discount is 0 (a terminal state) or the episode is over. After a
@@ -161,13 +163,16 @@ def n_step(rewards: Array, discounts: Array, valid: Array, n: int) -> tuple[jax.
 
     Args:
         rewards, discounts, valid: float32 [..., K], as in `srl_jax.types.Window`, with K >= n.
-        n: steps.
+        n: steps; int32 [...] where they are a number of each window, known when it runs.
 
     Returns:
         r_t: float32 [...], the discounted sum of rewards.
         discount_t: float32 [...], the product of the discounts; 0 where a terminal state was met.
         offset: int32 [...], where to bootstrap from, 1..n steps after s_t.
     """
+    if not isinstance(n, int):  # what lies n steps ahead or more counts as behind the episode's end
+        steps = rewards.shape[-1]
+        valid, n = valid * (jnp.arange(steps) < n[..., None]), steps
     r_t = jnp.zeros(rewards.shape[:-1], rewards.dtype)
     discount_t = jnp.ones(rewards.shape[:-1], discounts.dtype)
     for k in range(n):

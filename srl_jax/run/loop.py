@@ -22,6 +22,7 @@ from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
 from srl_jax.loading import given_policy, initial_params
+from srl_jax.resets import reset, reset_key
 from srl_jax.run import ending
 from srl_jax.run.actor import make_env, yielding_threads
 from srl_jax.run.ending import Ending
@@ -166,7 +167,7 @@ class Run:
     @property
     def now(self) -> Now:
         """The numbers of the schedules, now."""
-        return self.schedules.at(self.env_steps)
+        return self.schedules.at(self.env_steps, self.updates)
 
     def each(self, tree: Any) -> Iterator[tuple[Seed, Any]]:
         """The seeds, each with its own of a tree on the device."""
@@ -236,7 +237,10 @@ class Run:
             seed.begin()
 
     def step(self) -> None:
-        """One step of every environment, and the updates that are due."""
+        """One step of every environment, and the updates that are due; before them a reset that is due."""
+        number = self.schedules.resets(self.env_steps)
+        if number > self.schedules.resets(self.env_steps - self.config.num_envs):
+            self.reset(number)
         frames = [seed.stacks.observations() for seed in self.seeds]
         now = self.state.params, frames, self.env_steps, self.now.epsilon
         stepping = self.env_threads.submit(self.act_and_step, *now)
@@ -246,6 +250,12 @@ class Run:
         for seed, step in zip(self.seeds, stepping.result(), strict=True):
             seed.take(*step)
         self.env_steps += self.config.num_envs
+
+    def reset(self, number: int) -> None:
+        """The number-th reset of the run; see `srl_jax.resets`."""
+        fresh = [self.agent.init(reset_key(seed.key, number), {}) for seed in self.seeds]
+        self.state = reset(self.state, self.device.stack(fresh), self.config.reset, self.config.shrink)
+        self.seeds[0].report.progress.note(f"reset {number} after {self.env_steps} env steps")
 
     def act_and_step(
         self, params: Params, frames: list[np.ndarray], step: int, epsilon: float
@@ -262,8 +272,8 @@ class Run:
 
     def update(self) -> None:
         """One update, from sampling windows to setting their priorities; waits for the device."""
-        _, beta, hyper = self.now
-        sampled = [seed.replay.sample(self.config.batch_size, beta) for seed in self.seeds]
+        _, beta, hyper, own = self.now
+        sampled = [seed.replay.sample(self.config.batch_size, beta, **own) for seed in self.seeds]
         both, rl_alone = self.device.update, self.device.update_rl
         update = rl_alone if rl_alone and self.updates % self.config.srl_every else both
         self.state, td_errors, metrics = update(self.state, [window for window, _ in sampled], hyper)
@@ -307,10 +317,11 @@ class Run:
     def write_train_rows(self) -> None:
         """A "train" row of each seed: schedules, and means since the last one."""
         self.fetch()
-        epsilon, beta, _ = self.now
+        epsilon, beta, *_ = self.now
+        changes = self.schedules.row(self.env_steps, self.updates)
         for seed in self.seeds:
             values = {"epsilon": epsilon, "beta": beta, "replay/transitions": len(seed.replay)}
-            seed.report.train_row(self.env_steps, self.updates, values)
+            seed.report.train_row(self.env_steps, self.updates, values | changes)
 
     def start_evaluation(self) -> None:
         """Measures the latents of now, and has the policies of now evaluated while training goes on."""

@@ -1,9 +1,11 @@
-"""Schedules: numbers that change with env steps, as functions of a configuration and a count."""
+"""Schedules: what changes with env steps and updates, as functions of a configuration and these counts."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from srl_jax import annealing
 from srl_jax.config import Config
 from srl_jax.modes import MODES
 from srl_jax.run.actor import linear
@@ -17,11 +19,13 @@ class Now(NamedTuple):
         epsilon: of the behaviour policy.
         beta: the exponent of the importance weights (Schaul et al. 2016, section 3.4).
         hyper: the numbers of an update.
+        gamma_and_n: those of `Replay.sample`'s options "gamma" and "n_step" that are annealed.
     """
 
     epsilon: float
     beta: float
     hyper: Hyper
+    gamma_and_n: dict[str, Any]
 
 
 class Schedules:
@@ -35,9 +39,11 @@ class Schedules:
     def __init__(self, config: Config, hyper: Hyper):
         self._config, self._hyper = config, hyper
         self._rates = {name: float(rate) for name, rate in hyper.learning_rates.items()}
+        self._n = annealing.parse(config.n_anneal, int) if config.n_anneal else None
+        self._gamma = annealing.parse(config.gamma_anneal, float) if config.gamma_anneal else None
 
-    def at(self, env_steps: int) -> Now:
-        """The numbers at an env step.
+    def at(self, env_steps: int, updates: int = 0) -> Now:
+        """The numbers at an env step, of the update that comes after so many.
 
         Without RL, epsilon is 1 or, of a given policy, `pretrain_epsilon`. Learning rates fall linearly to
         `lr_final_share` of what they were.
@@ -50,7 +56,37 @@ class Schedules:
             left = linear(1.0, c.lr_final_share, c.steps, env_steps)
             rates = {name: np.float32(rate * left) for name, rate in self._rates.items()}
             hyper = hyper._replace(learning_rates=rates)
-        return Now(epsilon, linear(c.beta, c.beta_final, c.beta_anneal_steps, env_steps), hyper)
+        beta = linear(c.beta, c.beta_final, c.beta_anneal_steps, env_steps)
+        return Now(epsilon, beta, hyper, self._annealed(env_steps, updates))
+
+    def _annealed(self, env_steps: int, updates: int) -> dict[str, Any]:
+        since, found = self.since_reset(env_steps, updates), {}
+        if self._gamma:
+            found["gamma"] = self._gamma.gamma(since)
+        if self._n:
+            found["n_step"] = self._n.n(since)
+        return found
+
+    def resets(self, env_steps: int) -> int:
+        """Resets until the step that begins then, which starts with one where this has grown."""
+        c = self._config
+        if c.reset == "none":
+            return 0
+        return max(0, min(env_steps, c.reset_last or env_steps)) // c.reset_every
+
+    def since_reset(self, env_steps: int, updates: int) -> int:
+        """How many of the updates came after the newest reset, or after the start of the run."""
+        c, number = self._config, self.resets(env_steps)
+        if not number:
+            return updates
+        begins = -(-number * c.reset_every // c.num_envs) * c.num_envs  # the step that started with it
+        return max(0, updates - self.updates_due(begins - c.num_envs))
+
+    def row(self, env_steps: int, updates: int) -> dict[str, Any]:
+        """What a "train" row says of resets, n and gamma, of the step that ended then."""
+        began = env_steps - self._config.num_envs
+        found = self._annealed(began, updates)
+        return found if self._config.reset == "none" else found | {"resets": self.resets(began)}
 
     def updates_due(self, env_steps: int) -> int:
         """Updates that are due by the end of the step that starts then, since the start of the run.
@@ -67,3 +103,20 @@ class Schedules:
 def passed(before: int, now: int, every: int) -> bool:
     """Whether a multiple of `every` env steps lies in (before, now]."""
     return now // every > before // every
+
+
+def printed(config: Config, every: int) -> Iterator[str]:
+    """The lines of a table of resets, n and gamma over a run's first `steps` env steps.
+
+    Args:
+        config: resolved.
+        every: env steps between two lines; of these, the line says what holds for the step that begins then.
+    """
+    schedules = Schedules(config, Hyper({}, {}))
+    yield "env_steps  updates  resets  since_reset  n_step   gamma"
+    for env_steps in range(0, config.steps + 1, every):
+        updates = schedules.updates_due(env_steps - config.num_envs)
+        now = schedules.at(env_steps, updates).gamma_and_n
+        n, gamma = now.get("n_step", "-"), now.get("gamma", config.gamma)
+        resets, since = schedules.resets(env_steps), schedules.since_reset(env_steps, updates)
+        yield f"{env_steps:9}  {updates:7}  {resets:6}  {since:11}  {n:>6}  {gamma:.5f}"

@@ -140,7 +140,8 @@ class Seed:
         """Measures the latent of now, and has the policy of now play while training goes on."""
         values: dict[str, Any] = {}
         if self.diagnostics is not None:
-            values = self.diagnostics.measure(state, env_steps, self.replay, now.beta, now.hyper)
+            own = now.gamma_and_n
+            values = self.diagnostics.measure(state, env_steps, self.replay, now.beta, now.hyper, **own)
             if env_steps in self.diagnostics.steps:
                 self.keep(self.diagnostics.parts(state.params), env_steps, updates)
         if self.agent.mode.rl:
