@@ -44,7 +44,7 @@ def intensity(frames: Array, key: Array, scale: float = 0.05) -> Array:
     Returns:
         float32, the same shape; bright pixels may be a little above 1.
     """
-    factor = 1.0 + scale * jnp.clip(jax.random.normal(key), -2.0, 2.0)
+    factor = 1.0 + scale * jnp.clip(jax.random.normal(key, (), jnp.float32), -2.0, 2.0)
     return to_unit(frames) * factor
 
 

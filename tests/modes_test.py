@@ -218,7 +218,7 @@ def two_updates_of_the_registry(mode):
     terms = {n: o for n, o in agent.objectives.items() if n == RL}
     if MODES[mode].representation:
         terms |= {name: factory(context) for name, factory in objectives.REGISTRY.items()}
-    rules = {name: periodic(2) if name == RL else ema(0.9 - 0.1 * i) for i, name in enumerate(terms)}
+    rules = {name: periodic(2) if name == RL else ema(0.9 - 0.03 * i) for i, name in enumerate(terms)}
     terms = {name: objective._replace(slow=rules[name]) for name, objective in terms.items()}
     optimizer = make_optimizer(terms)
     state = random_state(make_init(agent.encoder, terms, MODES[mode], optimizer))

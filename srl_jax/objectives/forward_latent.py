@@ -72,7 +72,7 @@ def forward_latent(
         if target == "stopped":
             targets = jax.lax.stop_gradient(targets)
         z = latents.online(0)
-        losses: Array = jnp.zeros(len(z))
+        losses: Array = jnp.zeros(len(z), jnp.float32)
         for k in range(steps):
             z = apply(head, z, one_hot(window.actions[:, k], context.num_actions))
             losses += window.valid[:, k] * between(z, targets[k])

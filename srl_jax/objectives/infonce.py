@@ -62,7 +62,7 @@ def infonce(
 
     def init(key: jax.Array) -> Params:
         head = {"projection": init_project(key)}
-        return head | ({"bilinear": jnp.eye(outputs)} if similarity == "bilinear" else {})
+        return head | ({"bilinear": jnp.eye(outputs, dtype=jnp.float32)} if similarity == "bilinear" else {})
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         first, second = jax.random.split(key)
@@ -73,7 +73,7 @@ def infonce(
             logits = anchor @ head["bilinear"] @ positive.T
         else:
             logits = unit(anchor) @ unit(positive).T
-        valid = window.valid[:, temporal - 1] if temporal else jnp.ones(len(anchor))
+        valid = window.valid[:, temporal - 1] if temporal else jnp.ones(len(anchor), jnp.float32)
         logits = jnp.where(valid > 0, logits / temperature, -1e9)
         found = (jnp.argmax(logits, -1) == jnp.arange(len(anchor))).astype(jnp.float32)
         metrics = {"accuracy": masked_mean(found, valid)}

@@ -99,5 +99,5 @@ def over_others(function: Callable, valid: Array, *arrays: Array) -> Array:
     rows = len(arrays) * (0,)
     against = jax.vmap(function, (None,) * len(arrays) + rows)
     pairs = jax.vmap(against, rows + (None,) * len(arrays))(*arrays, *arrays)
-    others = valid * (1 - jnp.eye(len(valid)))
+    others = valid * (1 - jnp.eye(len(valid), dtype=jnp.float32))
     return valid * masked_mean(pairs, others, axis=1)

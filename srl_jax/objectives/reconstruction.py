@@ -42,7 +42,7 @@ def patch_mask(key: Array, height: int, width: int, share: float, side: int) -> 
 
     The image is cut into squares of `side` pixels, each of which is hidden with probability `share`.
     """
-    kept = jax.random.uniform(key, (-(-height // side), -(-width // side))) >= share
+    kept = jax.random.uniform(key, (-(-height // side), -(-width // side)), jnp.float32) >= share
     return jnp.repeat(jnp.repeat(kept, side, 0), side, 1)[:height, :width, None].astype(jnp.float32)
 
 
@@ -58,7 +58,7 @@ def corrupted(window: Window, key: Array, noise: float, masked: float, side: int
     frames = to_unit(window.frames)
     first, second = jax.random.split(key)
     if noise:
-        frames = jnp.clip(frames + noise * jax.random.normal(first, frames.shape), 0.0, 1.0)
+        frames = jnp.clip(frames + noise * jax.random.normal(first, frames.shape, jnp.float32), 0.0, 1.0)
     if masked:
         rows, _, height, width, _ = frames.shape
         mask = jax.vmap(lambda k: patch_mask(k, height, width, masked, side))
@@ -75,8 +75,8 @@ def largest_singular_value(matrix: Array) -> jax.Array:
     10 to 12).
     """
     constant = jax.lax.stop_gradient(matrix)
-    v = jax.random.normal(jax.random.key(0), (matrix.shape[1],))
-    u = jnp.zeros(matrix.shape[0])
+    v = jax.random.normal(jax.random.key(0), (matrix.shape[1],), jnp.float32)
+    u = jnp.zeros(matrix.shape[0], jnp.float32)
     for _ in range(POWER_ITERATIONS):
         u = unit(constant @ v)
         v = unit(constant.T @ u)
@@ -153,7 +153,7 @@ def reconstruction(
         else:
             losses = jax.vmap(mean_squared_error)(output, target)
         if gradient_penalty:
-            direction = jax.random.normal(draws[1], target.shape)
+            direction = jax.random.normal(draws[1], target.shape, jnp.float32)
             _, pull = jax.vjp(lambda z: decode(head, z), seen.online(0))
             (slope,) = pull(direction)
             losses += gradient_penalty * jnp.sum(slope**2, -1) / target[0].size

@@ -28,7 +28,7 @@ def two_hot(x: Array, bins: Array) -> jax.Array:
     above = jnp.clip(jnp.searchsorted(bins, x, side="right"), 1, len(bins) - 1)
     low, high = bins[above - 1], bins[above]
     share = (x - low) / (high - low)
-    return jnp.zeros(len(bins)).at[above - 1].set(1 - share).at[above].set(share)
+    return jnp.zeros(len(bins), jnp.float32).at[above - 1].set(1 - share).at[above].set(share)
 
 
 def two_hot_cross_entropy(logits: Array, reward: Array, bins: Array) -> jax.Array:
@@ -58,7 +58,7 @@ def reward(context: Context, *, weight: float = 1.0, hidden: int = 256, loss: st
     check_choice("loss", loss, REWARD_LOSSES)
     outputs = BINS if loss == "two_hot" else 1
     init, apply = functions(MLP(hidden, outputs), context.features + context.num_actions)
-    bins = jnp.linspace(-LARGEST, LARGEST, BINS)
+    bins = jnp.linspace(-LARGEST, LARGEST, BINS, dtype=jnp.float32)
 
     def losses_of(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         action = one_hot(window.actions[:, 0], context.num_actions)

@@ -89,7 +89,7 @@ def spr(
         behind = (latents.slow(ahead), slow_head) if target == "slow" else (latents.online(ahead), head)
         targets, below = jax.lax.stop_gradient(behind)
         z: Array = min_max(latents.online(0))
-        losses: Array = jnp.zeros(len(z))
+        losses: Array = jnp.zeros(len(z), jnp.float32)
         for k in range(steps):
             z = transition(head["transition"], z, one_hot(window.actions[:, k], context.num_actions))
             prediction = predict(head["predictor"], project(head["projection"], z))

@@ -69,7 +69,7 @@ def covariance_loss(z: Array) -> jax.Array:
     """
     centred = z - jnp.mean(z, 0)
     covariance = centred.T @ centred / (len(z) - 1)
-    return jnp.sum((covariance * (1 - jnp.eye(z.shape[-1]))) ** 2) / z.shape[-1]
+    return jnp.sum((covariance * (1 - jnp.eye(z.shape[-1], dtype=jnp.float32))) ** 2) / z.shape[-1]
 
 
 def vicreg(
@@ -148,7 +148,7 @@ def barlow(
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         first, second = (project(head, latents.of(draw(window, k)).online(0)) for k in jax.random.split(key))
         correlation = cross_correlation(first, second)
-        identity = jnp.eye(outputs)
+        identity = jnp.eye(outputs, dtype=jnp.float32)
         factor = identity + redundancy * (1 - identity)
         total = jnp.sum(factor * (correlation - identity) ** 2)
         return jnp.full(len(first), total), {}

@@ -37,7 +37,7 @@ def vae(context: Context, *, weight: float = 1.0, beta: float = 1.0) -> Objectiv
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         mean = latents.online(0)
         log_variance = jnp.clip(log_variance_of(head["log_variance"], mean), -10.0, 10.0)
-        noise = jax.random.normal(key, mean.shape)
+        noise = jax.random.normal(key, mean.shape, jnp.float32)
         output = decoder.apply(head["decoder"], mean + jnp.exp(0.5 * log_variance) * noise)
         target = image(window, 0)
         divergence = jax.vmap(gaussian_divergence)(mean, log_variance)
