@@ -25,7 +25,6 @@ from srl_jax.update import (
     make_init,
     make_update,
     passes,
-    periodic,
 )
 
 
@@ -180,7 +179,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
     if not mode.representation:
         terms = {}
     if mode.rl:
-        terms = {RL: algorithm.objective._replace(slow=periodic(config.slow_update_every)), **terms}
+        terms = {RL: algorithm.objective._replace(slow=algorithm.slow(config.slow_update_every)), **terms}
     optimizer = make_optimizer(
         terms,
         decoder_weight_decay=config.decoder_weight_decay,
