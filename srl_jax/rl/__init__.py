@@ -152,7 +152,7 @@ def q_learner(
     def draw_taus(key: jax.Array, name: str, batch: int, number: int) -> jax.Array | None:
         if not counts.cosines:
             return None
-        return jax.random.uniform(named_key(key, f"taus {name}"), (batch, number))
+        return jax.random.uniform(named_key(key, f"taus {name}"), (batch, number), jnp.float32)
 
     def init(key):
         z = jnp.zeros((1, context.features), jnp.float32)
@@ -206,7 +206,7 @@ def q_learner(
             """The return, and the slow outputs of a policy in the state bootstrapped from, [B, M]."""
             slow_t, selector_t = bootstrap(of)
             if not munchausen:
-                greedy = jax.nn.one_hot(jnp.argmax(selector_t, -1), actions)
+                greedy = jax.nn.one_hot(jnp.argmax(selector_t, -1), actions, dtype=jnp.float32)
                 return r_t, jax.vmap(values.average)(slow_t, greedy)
             policy = soft_policy(selector_t, munchausen_tau)
             q_tm1 = slow_values(of.slow(0))
