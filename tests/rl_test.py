@@ -399,7 +399,7 @@ LEARNT = {
     "categorical, wide": (values.categorical(v_min=-1000.0, v_max=1000.0), 100.0),
     "scalar": (values.scalar(), 1.0),
     "quantile": (values.quantile(quantiles=20), 1.0),
-    "implicit quantile": (values.implicit_quantile(quantiles=8, target_quantiles=8), 1.0),
+    "implicit quantile": (values.implicit_quantile(), 1.0),
 }
 
 
