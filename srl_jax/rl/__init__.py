@@ -6,17 +6,17 @@ from functools import partial
 from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import jax
-import jax.numpy as jnp
 
 from srl_jax.augment import make_view
 from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
-from srl_jax.rl.losses import midpoints, munchausen_return, n_step_one_early, soft_policy
+from srl_jax.rl.learner import Munchausen, QLearner
 from srl_jax.rl.losses import n_step as n_step_view
+from srl_jax.rl.losses import n_step_one_early
 from srl_jax.rl.values import Values, categorical, implicit_quantile, normal_logits, quantile, scalar
 from srl_jax.specs import check_choice, check_size, option_defaults
-from srl_jax.types import Array, Context, Latents, Objective, Params, Window
-from srl_jax.update import ema, named_key, periodic
+from srl_jax.types import Array, Context, Objective, Params
+from srl_jax.update import ema, periodic
 
 __all__ = ["REGISTRY", "register", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
 
@@ -142,107 +142,24 @@ def q_learner(
         "ema": lambda every: ema(slow_tau),
         "none": lambda every: None,
     }
-    counts, actions, outputs = values.taus, context.num_actions, values.outputs
-    network = QNetwork(
-        actions, outputs, hidden, dueling, noisy, noisy_std, values.prior, shared_hidden, counts.cosines
-    )
-    draw_view = make_view(view)
-    bonus = partial(munchausen_return, alpha=munchausen_alpha, tau=munchausen_tau, clip=munchausen_clip)
-
-    def draw_taus(key: jax.Array, name: str, batch: int, number: int) -> jax.Array | None:
-        if not counts.cosines:
-            return None
-        return jax.random.uniform(named_key(key, f"taus {name}"), (batch, number), jnp.float32)
-
-    def init(key):
-        z = jnp.zeros((1, context.features), jnp.float32)
-        return network.init(key, z, None, draw_taus(key, "init", 1, 1))["params"]
-
-    def apply(head: Params, latents: Array, noise: Array | None, taus: Array | None) -> Any:
-        return network.apply({"params": head}, latents, noise, taus)
-
-    def q_values(head: Params, latents: Array, key: jax.Array | None = None) -> Array:
-        noise, taus = None, None
-        if key is not None:
-            noise = network.draw_noise(key, 1, context.features)[0] if noisy else None
-            taus = draw_taus(key, "act", len(latents), counts.act)
-        elif counts.cosines:
-            taus = jnp.broadcast_to(midpoints(counts.act), (len(latents), counts.act))
-        return values.expected(apply(head, latents, noise, taus))
-
-    def loss(head, slow_head, latents: Latents, window: Window, key):
-        slow_head = head if slow == "none" else slow_head
-        r_t, discount_t, offset = N_STEP_VIEWS[target](window.rewards, window.discounts, window.valid, n_step)
-        a_tm1, batch = window.actions[:, 0], len(window.actions)
-        # The online network has one draw of noise for both observations, and so the same weights.
-        online, lagged = network.draw_noise(key, 2, context.features) if noisy else (None, None)
-        taus_t, taus_selector = (
-            draw_taus(key, name, batch, number)
-            for name, number in (("target", counts.target), ("selector", counts.act))
-        )
-
-        def seen(name: str, number: int) -> list[Latents]:
-            if view == "none":
-                return [latents]
-            keys = jax.random.split(named_key(key, name), number)
-            return [latents.of(draw_view(window, k)) for k in keys]
-
-        def bootstrap(of: Latents) -> tuple[jax.Array, jax.Array]:
-            """The slow outputs in the state bootstrapped from, and the values that choose an action there."""
-            z_t = of.slow(offset)
-            slow_t = jax.lax.stop_gradient(apply(slow_head, z_t, lagged, taus_t))
-            if double:
-                z_t = jax.lax.stop_gradient(of.online(offset))
-                frozen = jax.lax.stop_gradient(head)
-                return slow_t, values.expected(apply(frozen, z_t, online, taus_selector))
-            if taus_selector is None:
-                return slow_t, values.expected(slow_t)
-            return slow_t, slow_values(z_t)
-
-        def slow_values(z: Array) -> jax.Array:
-            return jax.lax.stop_gradient(values.expected(apply(slow_head, z, lagged, taus_selector)))
-
-        def averaged(of: Latents) -> tuple[jax.Array, jax.Array]:
-            """The return, and the slow outputs of a policy in the state bootstrapped from, [B, M]."""
-            slow_t, selector_t = bootstrap(of)
-            if not munchausen:
-                greedy = jax.nn.one_hot(jnp.argmax(selector_t, -1), actions, dtype=jnp.float32)
-                return r_t, jax.vmap(values.average)(slow_t, greedy)
-            policy = soft_policy(selector_t, munchausen_tau)
-            q_tm1 = slow_values(of.slow(0))
-            return (
-                jax.vmap(bonus)(r_t, discount_t, q_tm1, a_tm1, policy),
-                jax.vmap(values.average)(slow_t, policy),
-            )
-
-        def learnt(of: Latents, taus: Array | None) -> tuple[jax.Array, jax.Array, jax.Array]:
-            """Loss, error and largest value of each example, [B]."""
-            out_tm1 = apply(head, of.online(0), online, taus)
-            losses, td_error = jax.vmap(values.loss)(out_tm1, a_tm1, *bootstrapped, taus)
-            return losses, td_error, jnp.max(values.expected(out_tm1), -1)
-
-        if munchausen or target_copies > 1:  # one outcome in the place of all actions
-            returns, outcomes = zip(*map(averaged, seen("target view", target_copies)), strict=True)
-            even = jnp.full((batch, target_copies), 1 / target_copies, jnp.float32)
-            outcome = jax.vmap(values.average)(jnp.stack(outcomes, 1), even)[:, None]
-            bootstrapped = sum(returns) / target_copies, discount_t, outcome, even[:, :1]
-        else:
-            (of,) = seen("target view", 1)
-            bootstrapped = r_t, discount_t, *bootstrap(of)
-        found = [
-            learnt(of, draw_taus(key, f"online {i}", batch, counts.online))
-            for i, of in enumerate(seen("view", copies))
-        ]
-        losses, td_error, q_max = (sum(x) / copies for x in zip(*found, strict=True))
-        if values.batch_mean:
-            td_error = jnp.mean(td_error, keepdims=True)
-        metrics = {"td_error": td_error, "q_max_mean": jnp.mean(q_max)}
-        # Importance weights correct the RL loss alone, so it is the RL loss that multiplies them.
-        return losses * window.weight, jax.lax.stop_gradient(metrics)
-
+    learner = QLearner(
+        values=values,
+        network=QNetwork(
+            context.num_actions, values.outputs, hidden, dueling, noisy, noisy_std, values.prior,
+            shared_hidden, values.taus.cosines,
+        ),
+        features=context.features,
+        step_view=partial(N_STEP_VIEWS[target], n=n_step),
+        double=double,
+        munchausen=Munchausen(munchausen_alpha, munchausen_tau, munchausen_clip) if munchausen else None,
+        view=None if view == "none" else make_view(view),
+        copies=copies,
+        target_copies=target_copies,
+        lagged=slow != "none",
+    )  # fmt: skip
     return Algorithm(
-        objective=Objective(init, loss, horizon=n_step),
-        q_values=q_values,
+        objective=Objective(learner.init, learner.loss, horizon=n_step),
+        q_values=learner.q_values,
         alpha=alpha if prioritized else 0.0,
         slow=rules[slow],
         acts_slow=act_with == "slow",

@@ -146,7 +146,7 @@ def munchausen_return(
     alpha: float = 0.9,
     tau: float = 0.03,
     clip: float = -1.0,
-) -> jax.Array:
+) -> Array:
     """The return with what Munchausen Q-learning adds to it (Vieillard et al. 2020, section 2).
 
     `r + alpha * clip(tau log pi(a | s_t), clip, 0) + discount * tau * H(pi(. | s_{t+n}))`, where pi is the

@@ -307,6 +307,7 @@ class Seed:
 
     def _learner(self, state: TrainState) -> dict[str, Any]:
         """What a checkpoint holds of the learner beside the parameters that act."""
-        names = ("slow", "opt_state", "step", *(("params",) if self.agent.algorithm.acts_slow else ()))
-        learner = {name: getattr(state, name) for name in names}
+        learner = {name: getattr(state, name) for name in ("slow", "opt_state", "step")}
+        if self.agent.acting(state) is not state.params:
+            learner["params"] = state.params
         return learner | {"key": jax.random.key_data(state.key)}
