@@ -147,9 +147,10 @@ class QLearner:
         if self.munchausen is None:
             policy = jax.nn.one_hot(jnp.argmax(selector_t, -1), selector_t.shape[-1], dtype=jnp.float32)
         else:
-            policy = soft_policy(selector_t, self.munchausen.tau)
+            alpha, tau, clip = self.munchausen
+            policy = soft_policy(selector_t, tau)
             q_tm1 = self._expected(frozen[1], of.slow(0), draws.slow, draws.selector)
-            bonus = partial(munchausen_return, **self.munchausen._asdict())
+            bonus = partial(munchausen_return, alpha=alpha, tau=tau, clip=clip)
             r_t = jax.vmap(bonus)(r_t, discount_t, q_tm1, a_tm1, policy)
         return r_t, jax.vmap(self.values.average)(slow_t, policy)
 
