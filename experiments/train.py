@@ -21,7 +21,7 @@ from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
 from srl_jax.files.resuming import all_to_resume, blank, going_on, is_run, say_anew
 from srl_jax.files.rundir import check_free, run_directory
-from srl_jax.training import check_game, check_sources, resolved
+from srl_jax.training import check_game, check_sources, completed, resolved
 
 from .command_line import flags as config_flags
 from .command_line import runtime
@@ -203,7 +203,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
 
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
-    manifests = all_to_resume(runs) if resume else [None] * len(runs)
+    manifests = all_to_resume(runs, completed) if resume else [None] * len(runs)
     if all(m and (checkpoint.NUMBERS not in m.files or m.env_steps >= config.steps) for m in manifests):
         print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
         return 0

@@ -13,7 +13,7 @@ from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config
 from srl_jax.diagnostics.functions import Functions, make_functions
 from srl_jax.modes import MODES, Mode, encoder_learning_rate, second_learning_rate
-from srl_jax.optim import RL, make_optimizer
+from srl_jax.optim import ENCODER, RL, make_optimizer
 from srl_jax.rl import Algorithm
 from srl_jax.types import Array, Context, Encoder, Objective, Params, TrainState, Window
 from srl_jax.update import (
@@ -25,7 +25,6 @@ from srl_jax.update import (
     make_init,
     make_update,
     passes,
-    periodic,
 )
 
 
@@ -119,6 +118,8 @@ class Agent(NamedTuple):
             optimizer's state, and no others: the parameters may still act while it runs.
         update_rl: the update that computes RL's loss alone, where `srl_every` asks for one; else None.
         follow: `srl_jax.update.make_follow`'s, to be called after every `follow_every` updates.
+        acting: TrainState -> the parameters that act: its own, or with the slow copies of RL's head and the
+            encoder in their place, as the algorithm says.
         act: (params, frames, key, step, epsilon) -> actions, with noise; otherwise `make_act`'s.
         act_eval: the same without noise.
         shapes: () -> the `TrainState` that `init` gives, in shapes and dtypes.
@@ -136,6 +137,7 @@ class Agent(NamedTuple):
     update_rl: Update | None
     follow: Callable[[TrainState], TrainState]
     follow_every: int
+    acting: Callable[[TrainState], Params]
     act: Act
     act_eval: Act
     shapes: Callable[[], TrainState]
@@ -180,7 +182,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
     if not mode.representation:
         terms = {}
     if mode.rl:
-        terms = {RL: algorithm.objective._replace(slow=periodic(config.slow_update_every)), **terms}
+        terms = {RL: algorithm.objective._replace(slow=algorithm.slow(config.slow_update_every)), **terms}
     optimizer = make_optimizer(
         terms,
         decoder_weight_decay=config.decoder_weight_decay,
@@ -217,6 +219,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         update_rl=jitted_update(passes(mode, [RL])) if config.srl_every > 1 else None,
         follow=jax.jit(make_follow(terms)),
         follow_every=follow_every(terms),
+        acting=slow_params if algorithm.acts_slow and mode.rl else lambda state: state.params,
         act=jitted_act(noisy=True),
         act_eval=jitted_act(noisy=False),
         shapes=lambda: jax.eval_shape(init, jax.random.key(0)),
@@ -226,6 +229,13 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         ),
         measures=make_functions(encoder, terms, mode, channels=frame_shape[-1], augment=config.augment),
     )
+
+
+def slow_params(state: TrainState) -> Params:
+    """The parameters with RL's slow copies of head and encoder (where there is one) in their place."""
+    slow = state.slow[RL]
+    encoder = {ENCODER: slow["encoder"]} if jax.tree.leaves(slow["encoder"]) else {}
+    return state.params | encoder | {RL: slow["head"]}
 
 
 class Seeds(NamedTuple):

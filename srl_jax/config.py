@@ -163,7 +163,11 @@ class Config:
     eps_final: float = _share(0.05, "epsilon of the behaviour policy at the end")
     eps_anneal_steps: int = _steps(1_000_000, "length of epsilon's linear schedule")
     eps_eval: float = _share(0.005, "epsilon in evaluations")
-    slow_update_every: int = _steps(500, "RL's slow copies are replaced in every k-th update", unit="updates")
+    slow_update_every: int = _steps(
+        500,
+        "RL's slow copies are replaced in every k-th update, where --rl has slow=periodic",
+        unit="updates",
+    )
 
     eval_every: int = _steps(100_000, "env steps between two evaluations of the policy (one epoch)")
     eval_games: int = _value(int, 10, "full games in one evaluation", "games", minimum=1)

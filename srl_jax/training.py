@@ -79,7 +79,6 @@ def resolved(config: Config) -> Config:
         ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
             these frames, or a logger's package is missing.
     """
-    from srl_jax import encoders, objectives, rl
     from srl_jax.agent import components
     from srl_jax.files import loggers
 
@@ -87,12 +86,19 @@ def resolved(config: Config) -> Config:
         plugins.load(config.imports)
         check_game(config, imported=True)
     loggers.check(config.loggers)
-    full = resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
+    full = completed(config)
     # Options may be valid one by one and not together, or not for these frames: only a factory knows. An
     # environment's own size and its number of actions are known once it is made; any will do for that.
     size = config.frame_size or 84
     components(config, (size, size, 1), num_actions=18)
     return full
+
+
+def completed(config: Config) -> Config:
+    """`srl_jax.config.resolve` with the registries as they are: what is imported is known; imports jax."""
+    from srl_jax import encoders, objectives, rl
+
+    return resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
 
 
 _SAME = {"encoder_from": "encoder", "policy_from": "game"}

@@ -224,9 +224,10 @@ def two_updates_of_the_registry(mode):
     state = random_state(make_init(agent.encoder, terms, MODES[mode], optimizer))
     update = jit(make_update(agent.encoder, terms, MODES[mode], optimizer))
     hyper = agent.hyper._replace(weights=dict.fromkeys(terms, np.float32(1)))
+    window = make_window(horizon=max(term.horizon for term in terms.values()) or 1, size=FRAME)
     states = [state]
     for _ in range(2):
-        states.append(update(states[-1], WINDOW, hyper)[0])
+        states.append(update(states[-1], window, hyper)[0])
     return rules, states
 
 

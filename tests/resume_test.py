@@ -20,7 +20,7 @@ from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.run import loop, seed
 from srl_jax.run.actor import seed_for
-from tests.helpers import SMALL, identical, jit, one_run
+from tests.helpers import SMALL, all_moved, identical, jit, one_run
 from tests.rundir_test import contents
 
 MODES = {
@@ -33,8 +33,12 @@ MODES = {
         "weight_decay": 0.1,
     },
     "pretrain": {"mode": "pretrain", "objectives": ("inverse",), "diagnostics": True},
+    "slow acts": {
+        "rl": "iqn:hidden=16,quantiles=8,noisy=true,prioritized=true,slow=ema,slow_tau=0.9,act_with=slow",
+    },
 }  # fmt: skip
 ENCODERS = {"rl_only": [104], "joint": [0, 60, 104], "pretrain": [0, 60, 104, 120]}
+ENCODERS |= {"slow acts": [104]}
 """Of every second checkpoint, which is that of 104, and what diagnostics keep."""
 EVERY = {"steps": 200, "log_every": 40, "eval_every": 60, "checkpoint_every": 52, "eval_games": 5}
 
@@ -123,6 +127,7 @@ def whole(tmp_path_factory):
         ("joint", [64, 156]),
         ("pretrain", [48]),
         ("pretrain", [20, 100, 132]),
+        ("slow acts", [60, 76]),
     ],
 )
 def test_a_run_that_is_stopped_and_goes_on_is_the_run_that_was_not(whole, tmp_path, mode, stops):
@@ -148,6 +153,18 @@ def test_a_run_that_is_stopped_and_goes_on_is_the_run_that_was_not(whole, tmp_pa
     ours, theirs = ([checkpoint.read_manifest(p / f).files for f in kept] for p in (path, whole_path))
     assert ours == theirs
     assert all(set(checkpoint.read_manifest(path / f).files) == {"params.msgpack"} for f in folders)
+
+
+def test_what_is_kept_of_a_run_whose_slow_network_acts_is_what_acts(whole, tmp_path):
+    config, path, _ = whole("slow acts")
+    go(config, tmp_path / "run", 104)
+    manifest = checkpoint.read_manifest(tmp_path / "run")
+    kept, learner = checkpoint.load(manifest), checkpoint.load_tree(manifest, "learner")
+    slow = learner["slow"]["rl"]
+    assert identical(kept, {"encoder": slow["encoder"], "rl": slow["head"]})
+    assert all_moved(kept, learner["params"])
+    # The last one of the whole run has nothing beside.
+    assert set(checkpoint.read_manifest(path).files) == {"params.msgpack"}
 
 
 def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(whole, tmp_path, monkeypatch):

@@ -17,6 +17,7 @@ from srl_jax.files import checkpoint, provenance
 from srl_jax.files.resuming import all_to_resume, going_on, to_resume
 from srl_jax.files.rundir import run_directory
 from srl_jax.run import ending
+from srl_jax.training import completed
 from tests.helpers import NOT_FINITE, write_run
 from tests.rundir_test import contents
 
@@ -97,6 +98,19 @@ def test_another_configuration_is_refused_with_what_differs(tmp_path):
     other.save(tmp_path / "run")
     with pytest.raises(ConfigError, match="000000100: of another configuration: seed is 0 there and 3 here"):
         to_resume(tmp_path / "run", other)
+
+
+def test_options_that_are_newer_than_a_run_have_their_defaults(tmp_path):
+    # Rainbow's options of before there were slow=, view= and others; a resolved Config has all.
+    old = dataclasses.replace(CONFIG, rl="dqn:double=true,n_step=3")
+    (made,) = make(tmp_path / "run", old, [100])
+    runs = [(tmp_path / "run", completed(old))]
+    with pytest.raises(ConfigError, match="another configuration: .*rl is dqn:double=true,n_step=3 there"):
+        all_to_resume(runs)
+    assert all_to_resume(runs, completed) == [made]
+    other = completed(dataclasses.replace(CONFIG, rl="dqn:double=true,n_step=3,slow=ema"))
+    with pytest.raises(ConfigError, match="another configuration: rl is"):
+        all_to_resume([(tmp_path / "run", other)], completed)
 
 
 def test_a_run_is_extended_and_says_what_depends_on_its_end(tmp_path, capsys):

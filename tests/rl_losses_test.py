@@ -14,9 +14,12 @@ from srl_jax.rl.losses import (
     categorical_projection,
     categorical_q_learning,
     huber,
+    munchausen_return,
     n_step,
+    n_step_one_early,
     q_learning,
     quantile_q_learning,
+    soft_policy,
 )
 from tests.helpers import jit
 
@@ -166,16 +169,16 @@ def test_categorical_q_learning_by_hand():
     assert float(loss(1)) == pytest.approx(0.5 * np.log(4) + 0.5 * np.log(2), rel=1e-5)
 
 
-@pytest.mark.parametrize("kappa", [0.5, 1.0, 2.0])
-def test_quantile_q_learning_is_rlax_quantile_q_learning(kappa):
+@pytest.mark.parametrize(("kappa", "drawn"), [(0.5, False), (1.0, False), (2.0, False), (1.0, True)])
+def test_quantile_q_learning_is_rlax_quantile_q_learning(kappa, drawn):
     x = transitions()
-    shares = (jnp.arange(ATOMS) + 0.5) / ATOMS
+    taus = np.random.default_rng(1).random(ATOMS, np.float32) if drawn else (np.arange(ATOMS) + 0.5) / ATOMS
 
     def ours(q, r, d, slow, selector, a):
-        return quantile_q_learning(q, a, r, d, slow, selector, kappa)
+        return quantile_q_learning(q, a, r, d, slow, selector, kappa, taus if drawn else None)
 
     def theirs(q, r, d, slow, selector, a):  # [M, A]; a distribution of one number is its own mean
-        return rlax.quantile_q_learning(q.T, shares, a, r, d, selector[None], slow.T, kappa)
+        return rlax.quantile_q_learning(q.T, jnp.asarray(taus), a, r, d, selector[None], slow.T, kappa)
 
     same_and_alone_in_the_first(ours, theirs, x)
 
@@ -196,6 +199,33 @@ def test_quantile_q_learning_by_hand():
         quantiles, jnp.int32(0), jnp.float32(1), jnp.float32(0.5), slow, jnp.array([0.0, 1.0])
     )
     assert float(value) == pytest.approx(0.5 + 0.75)
+
+
+def test_munchausen_by_hand_and_as_the_paper_writes_it():
+    # Two actions of one value: log(1/2) = -0.6931 each. At tau = 0.5 the bonus is -0.3466 of which nine
+    # tenths count, and the entropy adds 0.5 * 0.6931: with a discount of 0.5, 1 - 0.3119 + 0.1733 = 0.8614.
+    q, policy = jnp.zeros(2), soft_policy(jnp.zeros(2), 0.5)
+    value = munchausen_return(jnp.float32(1), jnp.float32(0.5), q, 0, policy, tau=0.5)
+    assert float(value) == pytest.approx(0.8614, abs=1e-4)
+    # The other action is worth 2 more; 0.5 log pi = -2.009 is cut off at -1.
+    value = munchausen_return(jnp.float32(1), jnp.float32(0), jnp.array([0.0, 2.0]), 0, policy, tau=0.5)
+    assert float(value) == pytest.approx(0.1)
+
+    # r + alpha clip(tau log pi(a | s)) + discount sum_b pi(b) (q(b) - tau log pi(b))
+    x, (alpha, tau, clip) = transitions(), (0.9, 0.7, -1.5)
+    log_pi = [q / tau - np.log(np.exp(q / tau).sum(-1, keepdims=True)) for q in (x["q_tm1"], x["q_slow_t"])]
+    bonus = np.clip(tau * log_pi[0][np.arange(BATCH), x["a_tm1"]], clip, 0)
+    soft = (np.exp(log_pi[1]) * (x["q_slow_t"] - tau * log_pi[1])).sum(-1)
+    expected = x["r_t"] + alpha * bonus + x["discount_t"] * soft
+    assert (bonus == clip).any() and (bonus > clip).any()
+
+    def target(q_tm1, a_tm1, r_t, discount_t, q_slow_t):
+        policy = soft_policy(q_slow_t, tau)
+        r_t = munchausen_return(r_t, discount_t, q_tm1, a_tm1, policy, alpha, tau, clip)
+        return r_t + discount_t * policy @ q_slow_t
+
+    ours = jit(jax.vmap(target))(*(x[n] for n in ("q_tm1", "a_tm1", "r_t", "discount_t", "q_slow_t")))
+    close(ours, expected)
 
 
 def test_categorical_projection_by_hand():
@@ -303,3 +333,16 @@ def test_n_step_by_hand():
     np.testing.assert_array_equal(r_t, [3, 2, 2])
     np.testing.assert_array_equal(discount_t, [0.125, 0, 0.25])
     assert int(offset[0]) == 3 and int(offset[2]) == 2
+
+
+def test_n_step_one_early_by_hand():
+    # gamma 0.5, rewards 1, 2, 4, n = 3. Going on, and a terminal state after the third step, which is not
+    # noticed: 3, and s_{t+2} with 0.125. After the second it is: 2, no bootstrap. Truncated after the second:
+    # 2, and s_{t+1} with 0.25.
+    rewards = np.array([[1, 2, 4], [1, 2, 4], [1, 2, 0], [1, 2, 0]], np.float32)
+    discounts = np.array([[0.5] * 3, [0.5, 0.5, 0], [0.5, 0, 0], [0.5, 0.5, 0]], np.float32)
+    valid = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 0]], np.float32)
+    r_t, discount_t, offset = jit(partial(n_step_one_early, n=3))(rewards, discounts, valid)
+    np.testing.assert_array_equal(r_t, [3, 3, 2, 2])
+    np.testing.assert_array_equal(discount_t, [0.125, 0.125, 0, 0.25])
+    np.testing.assert_array_equal(offset[np.array([0, 1, 3])], [2, 2, 1])

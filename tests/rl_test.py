@@ -155,9 +155,15 @@ def test_loss_is_rlax_on_the_n_step_view(kind, double, dueling, n_step):
     np.testing.assert_allclose(metrics["q_max_mean"], q_values.max(-1).mean(), rtol=1e-5)
 
 
-def test_gradient_flows_through_the_sampled_state_alone():
-    # With double Q-learning, the online network also sees the state bootstrapped from.
-    algorithm = rl.rainbow(CONTEXT, noisy=False, **SMALL)
+@pytest.mark.parametrize(
+    ("row", "options"),
+    [
+        ("rainbow", SMALL | {"noisy": False}),  # double: the online network sees the state bootstrapped from
+        ("iqn", {"munchausen": True, "quantiles": 4, "hidden": 8}),
+    ],
+)
+def test_gradient_flows_through_the_sampled_state_alone(row, options):
+    algorithm = rl.REGISTRY[row](CONTEXT, **options)
     head, slow_head = (random_params(algorithm.objective.init, seed) for seed in (1, 2))
     online, slow, window = make_case()
 
@@ -246,6 +252,9 @@ def test_rows_are_what_their_names_say():
         assert sum(np.prod(shape) for shape in leaf_names(rows[name]).values()) == hidden + out
     assert rows["rainbow"].objective.horizon == 3 and rows["rainbow"].alpha == 0.5
     assert rl.rainbow(CONTEXT, alpha=0.7).alpha == 0.7
+    assert rows["drq"].objective.horizon == 10
+    iqn = {name: shape for name, shape in leaf_names(rows["iqn"]).items() if "kernel" in name}
+    assert sorted(iqn.values()) == [(FEATURES, 512), (64, FEATURES), (512, ACTIONS)]
     # dqn and double have the same network; they differ in who chooses the action bootstrapped from.
     head, slow_head = (random_params(rows["dqn"].objective.init, seed) for seed in (1, 2))
     online, slow, window = make_case()
@@ -261,7 +270,9 @@ def test_rows_are_what_their_names_say():
 def test_a_row_has_the_options_that_something_reads():
     parts = set(specs.option_defaults(rl.q_learner))
     distribution = specs.option_defaults(values.categorical)
-    own = {"c51": set(distribution), "qr_dqn": {"quantiles"}, "double": set(), "dqn": set()}
+    taus = {"quantiles", "target_quantiles", "act_quantiles", "cosines"}
+    own = {"c51": set(distribution), "qr_dqn": {"quantiles"}, "iqn": taus}
+    own |= dict.fromkeys(("double", "dqn", "drq"), set())
     for name, options in own.items():
         assert set(specs.option_defaults(rl.REGISTRY[name])) == parts | options
     rainbow = specs.option_defaults(rl.rainbow)
@@ -351,7 +362,20 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
         ({"v_min": 1e6, "v_max": 1e6 + 1}, "float32 has no 51 .* atoms from 1000000.0 to 1000001.0"),
         ({"v_min": -3e38, "v_max": 3e38}, "float32 has no 51 evenly spaced atoms"),
         ({"v_min": 0.0, "v_max": 1e-44}, "float32 has no 51 evenly spaced atoms"),
-        ({"priority": "entropy"}, "priority: .*valid: cross_entropy, kl"),
+        ({"priority": "entropy"}, "priority: .*valid: cross_entropy, kl, batch_mean"),
+        ({"shared_hidden": True, "dueling": False}, "shared_hidden=true needs dueling=true"),
+        ({"munchausen": True}, "munchausen=true averages over actions and picks none; it needs double=false"),
+        ({"munchausen": True, "double": False, "munchausen_tau": 0.0}, "munchausen_tau must be above 0"),
+        ({"view": "rotate"}, "view: .*valid: shift"),
+        ({"copies": 2}, "with view=none all copies are the same; give a view, say view=shift"),
+        ({"target_copies": 2}, "with view=none all copies are the same"),
+        ({"copies": 0}, "copies must be at least 1"),
+        ({"slow": "fast"}, "slow: .*valid: periodic, ema, none"),
+        ({"slow": "ema", "slow_tau": 1.0}, "tau must be at least 0 and below 1"),
+        ({"slow": "none", "act_with": "slow"}, "act_with=slow needs a slow network; slow=none has none"),
+        ({"act_with": "fast"}, "act_with: .*valid: online, slow"),
+        ({"target": "s_t"}, "target: .*valid: s_t.n, s_t.n-1"),
+        ({"target": "s_t+n-1", "n_step": 1}, "target=s_t.n-1 needs n_step of at least 2"),
         ({"alpha": 1.5}, "alpha must be at most 1"),
         ({"hidden": 2**16 + 1}, "hidden must be at least 1 and at most 65536"),
         ({"atoms": 2**31 - 1}, "atoms must be at least 2 and at most 65536"),
@@ -365,6 +389,9 @@ def test_options_that_cannot_be_are_refused(options, message):
 def test_quantiles_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match="quantiles must be at least 1 and at most 65536"):
         values.quantile(quantiles=0)
+    for name in specs.option_defaults(values.implicit_quantile):
+        with pytest.raises(ValueError, match=f"^{name} must be at least 1 and at most 65536"):
+            values.implicit_quantile(**{name: 0})
 
 
 LEARNT = {
@@ -372,6 +399,7 @@ LEARNT = {
     "categorical, wide": (values.categorical(v_min=-1000.0, v_max=1000.0), 100.0),
     "scalar": (values.scalar(), 1.0),
     "quantile": (values.quantile(quantiles=20), 1.0),
+    "implicit quantile": (values.implicit_quantile(), 1.0),
 }
 
 

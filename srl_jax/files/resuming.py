@@ -1,7 +1,7 @@
 """Where a run is resumed from, and whether what lies in a directory is a run at all. Imports no jax."""
 
 import contextlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from srl_jax import config
@@ -66,13 +66,20 @@ def _is_config(file: Path) -> bool:
     return isinstance(values, dict) and {"game", "mode", "versions"} <= values.keys()
 
 
-def to_resume(path: Path, wanted: Config, at_most: int | None = None) -> Manifest | None:
+def to_resume(
+    path: Path,
+    wanted: Config,
+    at_most: int | None = None,
+    completed: Callable[[Config], Config] = lambda config: config,
+) -> Manifest | None:
     """The checkpoint from which the run in a directory can be resumed; writes nothing.
 
     Args:
         path: of a run directory, or of one that is still to be made.
         wanted: resolved.
         at_most: env steps; newer checkpoints do not count.
+        completed: what a configuration of an earlier version means: options of --rl, --encoder and
+            --objective that are newer than the run take their defaults.
 
     Returns:
         The manifest of the newest one that is whole, or None where the run has to begin. One without
@@ -87,7 +94,7 @@ def to_resume(path: Path, wanted: Config, at_most: int | None = None) -> Manifes
         say_anew(path)
         return None
     there, about = config.read(path)
-    if differing := another_run(there, wanted):
+    if differing := another_run(completed(there), wanted):
         raise ConfigError(
             f"--out={path}: the run there has another configuration: {differing}; srl-jax resume {path} "
             "takes its own, name another directory, or --overwrite without --resume starts anew"
@@ -101,7 +108,7 @@ def to_resume(path: Path, wanted: Config, at_most: int | None = None) -> Manifes
             )
         say_anew(path)
         return None
-    if differing := another_run(manifest.config, wanted):
+    if differing := another_run(completed(manifest.config), wanted):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
     if checkpoint.NUMBERS not in manifest.files:
         if wanted.steps > there.steps:
@@ -188,7 +195,9 @@ def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[None]:
         yield
 
 
-def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
+def all_to_resume(
+    runs: list[tuple[Path, Config]], completed: Callable[[Config], Config] = lambda config: config
+) -> list[Manifest | None]:
     """`to_resume` of runs that are resumed in step: checkpoints of the same env step, or None for all.
 
     Raises:
@@ -196,7 +205,7 @@ def all_to_resume(runs: list[tuple[Path, Config]]) -> list[Manifest | None]:
     """
     at_most = None
     while True:
-        found = [to_resume(path, wanted, at_most) for path, wanted in runs]
+        found = [to_resume(path, wanted, at_most, completed) for path, wanted in runs]
         steps = [manifest.env_steps for manifest in found if manifest is not None]
         if len(steps) < len(runs):
             first, wanted = runs[found.index(None)]

@@ -3,19 +3,29 @@
 import inspect
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import jax
-import jax.numpy as jnp
 
+from srl_jax.augment import make_view
 from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
+from srl_jax.rl.learner import Munchausen, QLearner
 from srl_jax.rl.losses import n_step as n_step_view
-from srl_jax.rl.values import Values, categorical, normal_logits, quantile, scalar
-from srl_jax.specs import check_size, option_defaults
-from srl_jax.types import Array, Context, Latents, Objective, Params, Window
+from srl_jax.rl.losses import n_step_one_early
+from srl_jax.rl.values import Values, categorical, implicit_quantile, normal_logits, quantile, scalar
+from srl_jax.specs import check_choice, check_size, option_defaults
+from srl_jax.types import Array, Context, Objective, Params
+from srl_jax.update import ema, periodic
 
 __all__ = ["REGISTRY", "register", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
+
+SLOW, ACTORS = ("periodic", "ema", "none"), ("online", "slow")
+N_STEP_VIEWS = {"s_t+n": n_step_view, "s_t+n-1": n_step_one_early}
+"""Where a target bootstraps from, by name; the second is a defect."""
+
+Rule: TypeAlias = Callable[[Params, Params, Array], Params]
+"""How a slow copy follows, as of `srl_jax.types.Objective.slow`."""
 
 
 class QFunction(Protocol):
@@ -28,15 +38,21 @@ class Algorithm(NamedTuple):
     """An RL algorithm: its term of the loss, how it values actions, and what it asks of replay.
 
     Attributes:
-        objective: the loss; its metrics are `td_error` float32 [B], what priorities are made of, and
-            `q_max_mean`, a scalar: the mean over the batch of the largest value of s_t.
+        objective: the loss; its metrics are `td_error` float32 [B], what priorities are made of (or [k], of
+            the first k examples, where the others keep theirs), and `q_max_mean`, a scalar: the mean over the
+            batch of the largest value of s_t.
         q_values: (head, latents [B, D], key | None) -> float32 [B, A]; without a key, without noise.
         alpha: the priority exponent; 0 where replay is uniform.
+        slow: --slow_update_every -> the rule by which the slow copies of head and encoder follow; None where
+            there are none.
+        acts_slow: whether the slow copies act, in training and in evaluations.
     """
 
     objective: Objective
     q_values: QFunction
     alpha: float
+    slow: Callable[[int], Rule | None] = periodic
+    acts_slow: bool = False
 
 
 def q_learner(
@@ -51,6 +67,18 @@ def q_learner(
     noisy_std: float = 0.1,
     alpha: float = 0.5,
     hidden: int = 512,
+    shared_hidden: bool = False,
+    munchausen: bool = False,
+    munchausen_alpha: float = 0.9,
+    munchausen_tau: float = 0.03,
+    munchausen_clip: float = -1.0,
+    view: str = "none",
+    copies: int = 1,
+    target_copies: int = 1,
+    slow: str = "periodic",
+    slow_tau: float = 0.995,
+    act_with: str = "online",
+    target: str = "s_t+n",
 ) -> Algorithm:
     """Deep Q-learning (Mnih et al. 2015) of a kind of value, with those parts of Rainbow that are asked for.
 
@@ -65,50 +93,77 @@ def q_learner(
         noisy_std: see `srl_jax.layers.NoisyDense`.
         alpha: the priority exponent (Schaul et al. 2016).
         hidden: width of each stream's hidden layer.
+        shared_hidden: the streams of a dueling network have one hidden layer, as Dopamine's have.
+        munchausen: the reward has a share of the action's log-probability under the softmax policy added,
+            and the target is of that policy (Vieillard et al. 2020); see `munchausen_return`.
+        munchausen_alpha, munchausen_tau, munchausen_clip: the share, the temperature, and the least bonus.
+        view: what s_t and the state bootstrapped from are seen through, each by draws of its own; see
+            `srl_jax.augment.make_view`. "none": as they are.
+        copies: K, the loss is a mean over so many views of s_t (Kostrikov et al. 2020, DrQ, section 3).
+        target_copies: M, the target is a mean over so many views of the state bootstrapped from.
+        slow: how the slow copies of encoder and head follow: "periodic", replaced after each
+            --slow_update_every updates; "ema", a moving average; "none", the online ones without gradient
+            take their place.
+        slow_tau: of the moving average, the share that stays in an update, see `srl_jax.update.ema`.
+        act_with: whether the "online" or the "slow" network acts, in training and in evaluations.
+        target: the state bootstrapped from; "s_t+n-1" is a defect of the buffers of Dopamine's Atari 100k
+            agents and of BBF, see `srl_jax.rl.losses.n_step_one_early` and docs/deviations.md.
 
     Raises:
-        ValueError: where n_step is 0, hidden is out of range, or alpha is above 1.
+        ValueError: where a number is out of range, a choice is unknown, or two options do not go together.
     """
     if n_step < 1:
         raise ValueError("n_step must be at least 1")
     check_size("hidden", hidden)
+    check_size("copies", copies)
+    check_size("target_copies", target_copies)
     if alpha > 1:
         raise ValueError("alpha must be at most 1")
-    network = QNetwork(context.num_actions, values.outputs, hidden, dueling, noisy, noisy_std, values.prior)
-
-    def init(key):
-        return network.init(key, jnp.zeros((1, context.features), jnp.float32), None)["params"]
-
-    def apply(head: Params, latents: Array, noise: Array | None) -> Any:
-        return network.apply({"params": head}, latents, noise)
-
-    def q_values(head: Params, latents: Array, key: jax.Array | None = None) -> Array:
-        noise = None if key is None or not noisy else network.draw_noise(key, 1, context.features)[0]
-        return values.expected(apply(head, latents, noise))
-
-    def loss(head, slow_head, latents: Latents, window: Window, key):
-        n = n_step if window.n_step is None else window.n_step
-        r_t, discount_t, offset = n_step_view(window.rewards, window.discounts, window.valid, n)
-        a_tm1 = window.actions[:, 0]
-        # The online network has one draw of noise for both observations, and so the same weights.
-        online, slow = network.draw_noise(key, 2, context.features) if noisy else (None, None)
-        out_tm1 = apply(head, latents.online(0), online)
-        slow_t = jax.lax.stop_gradient(apply(slow_head, latents.slow(offset), slow))
-        if double:
-            z_t = jax.lax.stop_gradient(latents.online(offset))
-            frozen = jax.lax.stop_gradient(head)
-            selector_t = values.expected(apply(frozen, z_t, online))
-        else:
-            selector_t = values.expected(slow_t)
-        losses, td_error = jax.vmap(values.loss)(out_tm1, a_tm1, r_t, discount_t, slow_t, selector_t)
-        metrics = {"td_error": td_error, "q_max_mean": jnp.mean(jnp.max(values.expected(out_tm1), -1))}
-        # Importance weights correct the RL loss alone, so it is the RL loss that multiplies them.
-        return losses * window.weight, jax.lax.stop_gradient(metrics)
-
+    for option, value, choices in (
+        ("slow", slow, SLOW), ("act_with", act_with, ACTORS), ("target", target, N_STEP_VIEWS),
+    ):  # fmt: skip
+        check_choice(option, value, choices)
+    if shared_hidden and not dueling:
+        raise ValueError("shared_hidden=true needs dueling=true; one stream has nobody to share with")
+    if munchausen and double:
+        raise ValueError("munchausen=true averages over actions and picks none; it needs double=false")
+    if munchausen and not (munchausen_tau > 0 and munchausen_clip <= 0):
+        raise ValueError("munchausen_tau must be above 0 and munchausen_clip at most 0")
+    if view == "none" and max(copies, target_copies) > 1:
+        raise ValueError("with view=none all copies are the same; give a view, say view=shift")
+    if act_with == "slow" and slow == "none":
+        raise ValueError("act_with=slow needs a slow network; slow=none has none")
+    if target == "s_t+n-1" and n_step < 2:
+        raise ValueError("target=s_t+n-1 needs n_step of at least 2; with 1 it would bootstrap from s_t")
+    if slow == "ema":
+        ema(slow_tau)  # raises where it is out of range
+    rules: dict[str, Callable[[int], Rule | None]] = {
+        "periodic": periodic,
+        "ema": lambda every: ema(slow_tau),
+        "none": lambda every: None,
+    }
+    learner = QLearner(
+        values=values,
+        network=QNetwork(
+            context.num_actions, values.outputs, hidden, dueling, noisy, noisy_std, values.prior,
+            shared_hidden, values.taus.cosines,
+        ),
+        features=context.features,
+        step_view=N_STEP_VIEWS[target],
+        n_step=n_step,
+        double=double,
+        munchausen=Munchausen(munchausen_alpha, munchausen_tau, munchausen_clip) if munchausen else None,
+        view=None if view == "none" else make_view(view),
+        copies=copies,
+        target_copies=target_copies,
+        lagged=slow != "none",
+    )  # fmt: skip
     return Algorithm(
-        objective=Objective(init, loss, horizon=n_step),
-        q_values=q_values,
+        objective=Objective(learner.init, learner.loss, horizon=n_step),
+        q_values=learner.q_values,
         alpha=alpha if prioritized else 0.0,
+        slow=rules[slow],
+        acts_slow=act_with == "slow",
     )
 
 
@@ -129,6 +184,7 @@ def rainbow(
     alpha: float = 0.5,
     priority: str = "cross_entropy",
     hidden: int = 512,
+    **options: Any,
 ) -> Algorithm:
     """Rainbow (Hessel et al. 2018), each part of which can be left out alone.
 
@@ -137,7 +193,7 @@ def rainbow(
         distributional: the values are `srl_jax.rl.values.categorical`, C51; otherwise `scalar`.
         atoms, v_min, v_max, init_std, priority: see `srl_jax.rl.values.categorical`; without a distribution
             nothing reads them, and they must keep their defaults.
-        double, dueling, noisy, prioritized, n_step, noisy_std, alpha, hidden: see `q_learner`.
+        double, dueling, noisy, prioritized, n_step, noisy_std, alpha, hidden, **options: see `q_learner`.
 
     Raises:
         ValueError: as `q_learner` and `categorical` do; or distributional is false and an option describes
@@ -160,7 +216,20 @@ def rainbow(
         noisy_std=noisy_std,
         alpha=alpha,
         hidden=hidden,
+        **options,
     )
+
+
+def with_options_of(row: Callable[..., Algorithm], *functions: Callable) -> Callable[..., Algorithm]:
+    """The row, whose signature says that its options are those of these functions, as the first has them."""
+    context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+    options: dict[str, inspect.Parameter] = {}
+    for function in functions:
+        for name, parameter in inspect.signature(function).parameters.items():
+            if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
+                options.setdefault(name, parameter)
+    row.__dict__["__signature__"] = inspect.Signature([context, *options.values()])
+    return row
 
 
 def q_learner_of(kind: Callable[..., Values], **defaults: Any) -> Callable[..., Algorithm]:
@@ -170,25 +239,28 @@ def q_learner_of(kind: Callable[..., Values], **defaults: Any) -> Callable[..., 
         kind: options -> Values, of `srl_jax.rl.values`.
         **defaults: options of `q_learner` that the row has another default of.
     """
-    context, _, *parts = inspect.signature(q_learner).parameters.values()
-    own = inspect.signature(kind).parameters
+    own = option_defaults(kind)
 
     def row(context: Context, **options: Any) -> Algorithm:
         values = kind(**{name: options.pop(name) for name in own if name in options})
         return q_learner(context, values, **options)
 
-    row.__dict__["__signature__"] = inspect.Signature([context, *parts, *own.values()])
-    return partial(row, **defaults)
+    return partial(with_options_of(row, q_learner, kind), **defaults)
 
 
+with_options_of(rainbow, rainbow, q_learner)
 REGISTRY = Registry(
     "rl",
     {
         "rainbow": rainbow,
         "c51": q_learner_of(categorical),
         "qr_dqn": q_learner_of(quantile),
+        "iqn": q_learner_of(implicit_quantile),
         "double": q_learner_of(scalar, double=True),
         "dqn": q_learner_of(scalar),
+        "drq": q_learner_of(
+            scalar, double=True, dueling=True, n_step=10, view="shift", copies=2, target_copies=2
+        ),
     },
 )
 register = REGISTRY.register

@@ -17,6 +17,9 @@ class QNetwork(nn.Module):
         hidden: width of each stream.
         dueling, noisy: the parts of Rainbow; noise_std only matters where noisy.
         prior: M constants added to the outputs of every action: what they start near; None: 0.
+        shared_hidden: whether the two streams of a dueling network have one hidden layer, as Dopamine's.
+        cosines: where above 0, latents are multiplied by an embedding of shares of probability, taus, in so
+            many cosines: `z * ReLU(linear(cos(pi i tau)))`, i from 0 (Dabney et al. 2018b, equation 4).
     """
 
     num_actions: int
@@ -26,15 +29,29 @@ class QNetwork(nn.Module):
     noisy: bool
     noisy_std: float
     prior: tuple[float, ...] | None = None
+    shared_hidden: bool = False
+    cosines: int = 0
 
     @nn.compact
-    def __call__(self, z: Array, noise: Array | None) -> Array:
+    def __call__(self, z: Array, noise: Array | None, taus: Array | None = None) -> Array:
         """float32 [B, D] -> float32 [B, A, M].
 
         Args:
             z: latents.
-            noise: a row of what `noise` draws; None acts with the means.
+            noise: a row of what `draw_noise` draws; None acts with the means.
+            taus: float32 [B, N] in [0, 1], where there are cosines; the result is [B, A, N * M] then.
         """
+        if taus is not None:
+            angles = jnp.pi * taus[..., None] * jnp.arange(self.cosines, dtype=jnp.float32)
+            embedded = nn.relu(Dense(z.shape[-1], name="embedding")(jnp.cos(angles)))
+            z = (z[:, None] * embedded).reshape(-1, z.shape[-1])
+        q = self._outputs(z, noise)
+        if taus is None:
+            return q
+        return jnp.moveaxis(q.reshape(*taus.shape, *q.shape[1:]), 1, 2).reshape(len(taus), q.shape[1], -1)
+
+    def _outputs(self, z: Array, noise: Array | None) -> Array:
+        """float32 [B, D] -> float32 [B, A, M]."""
         lengths = self._noise_lengths(z.shape[-1])
         parts: list = [None] * len(lengths)
         if self.noisy and noise is not None:
@@ -45,8 +62,10 @@ class QNetwork(nn.Module):
                 return NoisyDense(features, self.noisy_std, name=name)(x, parts.pop(0))
             return Dense(features, name=name)(x)
 
+        shared = nn.relu(layer("hidden", self.hidden, z)) if self.shared_hidden else None
+
         def stream(name: str) -> Array:
-            x = nn.relu(layer(f"{name}_hidden", self.hidden, z))
+            x = nn.relu(layer(f"{name}_hidden", self.hidden, z)) if shared is None else shared
             return layer(f"{name}_out", self._sizes[name], x).reshape(z.shape[0], -1, self.outputs)
 
         prior = 0.0 if self.prior is None else jnp.asarray(self.prior, jnp.float32)
@@ -71,5 +90,7 @@ class QNetwork(nn.Module):
 
     def _noise_lengths(self, features: int) -> list[int]:
         """The noise of each layer, in the order in which they are called."""
-        hidden = self.hidden
-        return [n for size in self._sizes.values() for n in (features + hidden, hidden + size)]
+        first, sizes = features + self.hidden, self._sizes.values()
+        if self.shared_hidden:
+            return [first, *(self.hidden + size for size in sizes)]
+        return [n for size in sizes for n in (first, self.hidden + size)]

@@ -97,12 +97,13 @@ def quantile_q_learning(
     q_quantiles_slow_t: Array,
     q_selector_t: Array,
     kappa: float = 1.0,
+    taus: Array | None = None,
 ) -> jax.Array:
-    """The quantile Huber loss of quantile (double) Q-learning, QR-DQN.
+    """The quantile Huber loss of quantile (double) Q-learning: QR-DQN, and IQN where the taus are drawn.
 
-    Output i is the online estimate of the return's quantile at (i + 0.5) / M, the midpoint of the i-th of M
-    equal shares of probability. Each is compared with each of the slow quantiles of the selected action,
-    scaled by the discount and shifted by the return (Dabney et al. 2018, equations 9 and 10, algorithm 1).
+    Output i is the online estimate of the return's quantile at tau_i. Each is compared with each of the slow
+    quantiles of the selected action, scaled by the discount and shifted by the return (Dabney et al. 2018,
+    equations 9 and 10, algorithm 1; Dabney et al. 2018b, equation 3).
 
     Args:
         q_quantiles_tm1: float32 [A, M], online quantiles of s_t, in units of reward; in any order.
@@ -112,6 +113,8 @@ def quantile_q_learning(
         q_quantiles_slow_t: float32 [A, L], slow quantiles of that state.
         q_selector_t: float32 [A], the expected values whose greedy action is evaluated.
         kappa: where the Huber loss becomes linear, above 0, in units of reward.
+        taus: float32 [M] in [0, 1], the online quantiles' shares of probability; None for the midpoints of M
+            equal shares, (i + 0.5) / M.
 
     Returns:
         float32 [], a sum over the M online quantiles and a mean over the L slow ones. The gradient flows into
@@ -124,9 +127,53 @@ def quantile_q_learning(
     target = jax.lax.stop_gradient(r_t + discount_t * q_quantiles_slow_t[jnp.argmax(q_selector_t)])
     quantiles = q_quantiles_tm1[a_tm1]
     error = target[None, :] - quantiles[:, None]
-    share = (jnp.arange(len(quantiles), dtype=jnp.float32) + 0.5) / len(quantiles)
-    weight = jnp.abs(share[:, None] - (error < 0))
+    taus = midpoints(len(quantiles)) if taus is None else taus
+    weight = jnp.abs(taus[:, None] - (error < 0))
     return jnp.sum(jnp.mean(weight * huber(error, kappa), 1))
+
+
+def midpoints(number: int) -> jax.Array:
+    """The midpoints of equal shares of probability, `(i + 0.5) / number`: float32 [number]."""
+    return (jnp.arange(number, dtype=jnp.float32) + 0.5) / number
+
+
+def munchausen_return(
+    r_t: Array,
+    discount_t: Array,
+    q_slow_tm1: Array,
+    a_tm1: Array,
+    policy_t: Array,
+    alpha: float = 0.9,
+    tau: float = 0.03,
+    clip: float = -1.0,
+) -> Array:
+    """The return with what Munchausen Q-learning adds to it (Vieillard et al. 2020, section 2).
+
+    `r + alpha * clip(tau log pi(a | s_t), clip, 0) + discount * tau * H(pi(. | s_{t+n}))`, where pi is the
+    softmax of q / tau. With it, and the average of the slow values under pi in place of the largest one, the
+    target is the paper's. The bonus is that of the action in s_t alone, however large n is.
+
+    Args:
+        r_t: float32 [], the (n-step) return up to the state bootstrapped from.
+        discount_t: float32 [], that state's discount; 0 where terminal.
+        q_slow_tm1: float32 [A], slow values of s_t.
+        a_tm1: int32 [], the action taken in s_t.
+        policy_t: float32 [A], pi in the state bootstrapped from, by `soft_policy`.
+        alpha: the share of the bonus that counts.
+        tau: the temperature, above 0, in units of reward.
+        clip: the least bonus, at most 0, in units of reward.
+
+    Returns:
+        float32 []. No gradient.
+    """
+    chex.assert_rank([r_t, discount_t, q_slow_tm1, a_tm1, policy_t], [0, 0, 1, 0, 1])
+    bonus = jnp.clip(tau * jax.nn.log_softmax(q_slow_tm1 / tau)[a_tm1], clip, 0.0)
+    return jax.lax.stop_gradient(r_t + alpha * bonus + discount_t * tau * entropy(policy_t))
+
+
+def soft_policy(q: Array, tau: float) -> jax.Array:
+    """The softmax of q / tau, float32 [..., A] -> [..., A]; tau in units of reward."""
+    return jax.nn.softmax(q / tau)
 
 
 def entropy(probs: Array) -> jax.Array:
@@ -179,3 +226,25 @@ def n_step(
         r_t = r_t + valid[..., k] * discount_t * rewards[..., k]
         discount_t = discount_t * jnp.where(valid[..., k] > 0, discounts[..., k], 1.0)
     return r_t, discount_t, jnp.sum(valid[..., :n], -1).astype(jnp.int32)
+
+
+def n_step_one_early(
+    rewards: Array, discounts: Array, valid: Array, n: int | Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The n-step view as the buffers of Dopamine's Atari 100k agents and of BBF have it; a defect.
+
+    The n rewards and the discount are `n_step`'s, but the state bootstrapped from is one step earlier, and
+    it is not noticed that the last of the n steps ended in a terminal state.
+
+    Args:
+        rewards, discounts, valid: see `n_step`.
+        n: steps, at least 2.
+
+    Returns:
+        As `n_step`; offset is 0..n - 1.
+    """
+    before = jnp.concatenate([discounts[..., :1], discounts[..., :-1]], -1)
+    last = jnp.arange(discounts.shape[-1]) == jnp.asarray(n)[..., None] - 1
+    unnoticed = jnp.where(last, before, discounts)
+    r_t, discount_t, offset = n_step(rewards, unnoticed, valid, n)
+    return r_t, discount_t, offset - 1

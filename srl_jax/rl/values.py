@@ -22,26 +22,50 @@ from srl_jax.rl.losses import (
 from srl_jax.specs import check_size, choices_text
 from srl_jax.types import Array
 
-PRIORITIES = ("cross_entropy", "kl")
+PRIORITIES = ("cross_entropy", "kl", "batch_mean")
+
+
+class Taus(NamedTuple):
+    """How many shares of probability, taus, a head is asked for; none where its outputs do not depend on any.
+
+    Attributes:
+        online: M of the state that is learnt about.
+        target: of the state bootstrapped from.
+        act: where the expected returns of actions are compared.
+        cosines: how many the head embeds each share by.
+    """
+
+    online: int = 0
+    target: int = 0
+    act: int = 0
+    cosines: int = 0
 
 
 class Values(NamedTuple):
     """A kind of value, as pure functions.
 
     Attributes:
-        outputs: M, the head's numbers for each action.
+        outputs: M, the head's numbers for each action; of each share of probability, where there are taus.
         expected: float32 [..., M] -> float32 [...], the expected return, which a greedy policy compares.
-        loss: of one example, (out_tm1 [A, M], a_tm1 [], r_t [], discount_t [], out_slow_t [A, M],
-            q_selector_t [A]) -> (loss [], td_error []), float32; the arguments are those of
-            `srl_jax.rl.losses`, `out` the head's numbers. The gradient of the loss flows into out_tm1 alone;
-            td_error is what priorities are made of.
+        loss: of one example, (out_tm1 [A, M], a_tm1 [], r_t [], discount_t [], out_slow_t [A', M'],
+            q_selector_t [A'], taus) -> (loss [], td_error []), float32; the arguments are those of
+            `srl_jax.rl.losses`, `out` the head's numbers, taus those of out_tm1, float32 [M], or None. The
+            gradient of the loss flows into out_tm1 alone; td_error is what priorities are made of.
+        average: (out [A, M], probs [A]) -> float32 [M], the head's numbers of what a policy is worth that
+            takes the actions with these probabilities.
         prior: M constants that the head's outputs of every action are added to; None: none.
+        taus: where there are some, they go into the head, drawn anew for each example, and its M numbers of
+            an action are as many quantiles as it is asked for.
+        batch_mean: whether the batch's first example alone has its priority set, to the mean of all.
     """
 
     outputs: int
     expected: Callable[[Array], Array]
-    loss: Callable[[Array, Array, Array, Array, Array, Array], tuple[jax.Array, jax.Array]]
+    loss: Callable[..., tuple[jax.Array, jax.Array]]
+    average: Callable[[Array, Array], Array]
     prior: tuple[float, ...] | None = None
+    taus: Taus = Taus()
+    batch_mean: bool = False
 
 
 def scalar() -> Values:
@@ -53,11 +77,11 @@ def scalar() -> Values:
     def expected(outputs: Array) -> Array:
         return outputs[..., 0]
 
-    def loss(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t):
+    def loss(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t, taus):
         td_error = q_learning(expected(out_tm1), a_tm1, r_t, discount_t, expected(out_slow_t), q_selector_t)
         return huber(td_error), td_error
 
-    return Values(1, expected, loss)
+    return Values(1, expected, loss, average_outputs)
 
 
 def categorical(
@@ -76,7 +100,9 @@ def categorical(
             reward, at least the distance of two atoms; 0: near uniform, as in C51. See `normal_logits`.
         priority: what priorities are made of: "cross_entropy" with the target, the loss itself, as Dopamine,
             dqn_zoo and the thesis have it, or "kl", the Kullback-Leibler divergence (Hessel et al. 2018,
-            section 3), which leaves out the target's own entropy.
+            section 3), which leaves out the target's own entropy. "batch_mean": the mean of the batch's
+            cross-entropies, for the first of its examples alone, the others keeping theirs: a defect of BBF's
+            code, where priorities are set so (docs/deviations.md).
 
     Raises:
         ValueError: where atoms is out of range, v_min is not below v_max, float32 has no such atoms, init_std
@@ -90,15 +116,20 @@ def categorical(
     def expected(outputs: Array) -> Array:
         return jax.nn.softmax(outputs) @ support
 
-    def loss(out_tm1, a_tm1, *bootstrap):
+    def loss(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t, taus):
+        bootstrap = r_t, discount_t, out_slow_t, q_selector_t
         cross_entropy = categorical_q_learning(out_tm1, support, a_tm1, *bootstrap)
-        if priority == "cross_entropy":
+        if priority != "kl":
             return cross_entropy, cross_entropy
         # The target's entropy says how random a return is, not how surprising.
         target = categorical_target(support, *bootstrap)
         return cross_entropy, jnp.maximum(cross_entropy - entropy(target), 0.0)
 
-    return Values(atoms, expected, loss, normal_logits(support, init_std) if init_std else None)
+    def average(outputs: Array, probs: Array) -> Array:
+        return jnp.log(jnp.maximum(probs @ jax.nn.softmax(outputs), 1e-30))
+
+    prior = normal_logits(support, init_std) if init_std else None
+    return Values(atoms, expected, loss, average, prior, batch_mean=priority == "batch_mean")
 
 
 def quantile(*, quantiles: int = 200) -> Values:
@@ -113,16 +144,48 @@ def quantile(*, quantiles: int = 200) -> Values:
         ValueError: where quantiles is out of range.
     """
     check_size("quantiles", quantiles)
+    return Values(quantiles, mean_quantile, quantile_loss, average_outputs)
 
-    def expected(outputs: Array) -> Array:
-        return jnp.mean(outputs, -1)
 
-    def loss(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t):
-        td_error = q_learning(expected(out_tm1), a_tm1, r_t, discount_t, expected(out_slow_t), q_selector_t)
-        losses = quantile_q_learning(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t)
-        return losses, td_error
+def implicit_quantile(
+    *, quantiles: int = 64, target_quantiles: int = 64, act_quantiles: int = 32, cosines: int = 64
+) -> Values:
+    """The return at shares of probability that are drawn and go into the head, IQN (Dabney et al. 2018b).
 
-    return Values(quantiles, expected, loss)
+    The shares, taus, are uniform on [0, 1], drawn anew for each example; an evaluation acts with the
+    midpoints of equal shares. Priorities are made of the temporal-difference error of the expected returns.
+
+    Args:
+        quantiles: N, taus of each state that is learnt about (equation 3).
+        target_quantiles: N', taus of each state bootstrapped from.
+        act_quantiles: K, taus over whose quantiles an action's expected return is the mean (equation 2).
+        cosines: n of the embedding of a tau (equation 4).
+
+    Raises:
+        ValueError: where an option is out of range.
+    """
+    taus = Taus(quantiles, target_quantiles, act_quantiles, cosines)
+    for name, value in zip(("quantiles", "target_quantiles", "act_quantiles", "cosines"), taus, strict=True):
+        check_size(name, value)
+    return Values(1, mean_quantile, quantile_loss, average_outputs, taus=taus)
+
+
+def mean_quantile(outputs: Array) -> Array:
+    """`Values.expected` of quantiles."""
+    return jnp.mean(outputs, -1)
+
+
+def quantile_loss(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t, taus):
+    """`Values.loss` of quantiles."""
+    bootstrap = r_t, discount_t, mean_quantile(out_slow_t), q_selector_t
+    td_error = q_learning(mean_quantile(out_tm1), a_tm1, *bootstrap)
+    losses = quantile_q_learning(out_tm1, a_tm1, r_t, discount_t, out_slow_t, q_selector_t, taus=taus)
+    return losses, td_error
+
+
+def average_outputs(outputs: Array, probs: Array) -> Array:
+    """`Values.average` where the head's numbers are returns themselves."""
+    return probs @ outputs
 
 
 def make_support(v_min: float, v_max: float, atoms: int) -> np.ndarray:

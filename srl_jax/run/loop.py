@@ -242,7 +242,7 @@ class Run:
         if number > self.schedules.resets(self.env_steps - self.config.num_envs):
             self.reset(number)
         frames = [seed.stacks.observations() for seed in self.seeds]
-        now = self.state.params, frames, self.env_steps, self.now.epsilon
+        now = self.agent.acting(self.state), frames, self.env_steps, self.now.epsilon
         stepping = self.env_threads.submit(self.act_and_step, *now)
         if all(len(seed.replay) for seed in self.seeds):
             for _ in range(self.schedules.updates_due(self.env_steps) - self.updates):
@@ -291,7 +291,7 @@ class Run:
             if not np.isfinite(td_error).all():
                 self.fetch()  # a loss says more
                 raise self.diverged(seed, "a temporal-difference error")
-            seed.replay.set_priorities(indices, td_error)
+            seed.replay.set_priorities(indices[: len(td_error)], td_error)
 
     # Rows and checkpoints
 
@@ -362,7 +362,7 @@ class Run:
         if self.config.keep_replay:
             return self.save()
         self.fetch()
-        for seed, params in self.each(self.state.params):
+        for seed, params in self.each(self.agent.acting(self.state)):
             seed.save_parameters(params, self.env_steps, self.updates)
         for seed in self.seeds:  # until all have theirs, they can be resumed from the ones before
             if seed.saved is not None and seed.saved.env_steps < self.env_steps:

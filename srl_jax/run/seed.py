@@ -145,7 +145,7 @@ class Seed:
             if env_steps in self.diagnostics.steps:
                 self.keep(self.diagnostics.parts(state.params), env_steps, updates)
         if self.agent.mode.rl:
-            self.evaluating = Evaluating(state.params, env_steps, updates, values)
+            self.evaluating = Evaluating(self.agent.acting(state), env_steps, updates, values)
             self.play()
         elif values:
             self.report.eval_row(env_steps, updates, values)
@@ -239,7 +239,8 @@ class Seed:
     def save(self, state: TrainState, env_steps: int, updates: int) -> None:
         """Writes a checkpoint that can be resumed from."""
         full = self.snapshot(state, env_steps)
-        self.saved = self.save_parameters(state.params, env_steps, updates, state=full, base=self.saved)
+        params = self.agent.acting(state)  # what others load
+        self.saved = self.save_parameters(params, env_steps, updates, state=full, base=self.saved)
         self.saved_position = self.replay.next_position.copy()
 
     def snapshot(self, state: TrainState, env_steps: int) -> checkpoint.State:
@@ -251,7 +252,7 @@ class Seed:
             arrays |= {f"{part}_{name}": x for name, x in found.items()}
         unchanged = self.replay.unchanged_chunks(self.saved_position) if self.saved else ()
         names = frozenset(f"replay_{name}" for name in unchanged)
-        trees = {"learner": _learner(state)}
+        trees = {"learner": self._learner(state)}
         if self.evaluating and self.evaluating.env_steps != env_steps:
             trees["evaluating"] = self.evaluating.params
         return checkpoint.State(trees, arrays, numbers, names)
@@ -286,7 +287,7 @@ class Seed:
         where, shapes = str(manifest.path), self.agent.shapes()
         try:
             params = checkpoint.load_into(shapes.params, checkpoint.load(manifest), where)
-            template = jax.eval_shape(_learner, shapes)
+            template = jax.eval_shape(self._learner, shapes)
             learner = checkpoint.load_into(template, checkpoint.load_tree(manifest, "learner"), where)
             numbers = checkpoint.load_numbers(manifest)
             for part, (_, restore) in self.parts(manifest.env_steps).items():
@@ -303,10 +304,11 @@ class Seed:
             raise ConfigError(f"{where}: cannot be resumed from: {type(error).__name__}: {error}") from None
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         key = jax.random.wrap_key_data(learner.pop("key"))
-        return real_copy(shapes._replace(params=params, key=key, **learner))
+        return real_copy(shapes._replace(**{"params": params, "key": key, **learner}))
 
-
-def _learner(state: TrainState) -> dict[str, Any]:
-    """What a checkpoint holds of the learner beside its parameters."""
-    learner = {name: getattr(state, name) for name in ("slow", "opt_state", "step")}
-    return learner | {"key": jax.random.key_data(state.key)}
+    def _learner(self, state: TrainState) -> dict[str, Any]:
+        """What a checkpoint holds of the learner beside the parameters that act."""
+        learner = {name: getattr(state, name) for name in ("slow", "opt_state", "step")}
+        if self.agent.acting(state) is not state.params:
+            learner["params"] = state.params
+        return learner | {"key": jax.random.key_data(state.key)}
