@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax.augment import random_shift
+from srl_jax.augment import make_view, random_shift
+from srl_jax.latents import make_latents
 from srl_jax.modes import MODES
 from srl_jax.optim import RL, make_optimizer
 from srl_jax.types import Encoder, Objective
@@ -17,12 +18,10 @@ from srl_jax.update import (
     make_act,
     make_follow,
     make_init,
-    make_latents,
     make_update,
     named_key,
     passes,
     periodic,
-    shift,
 )
 from srl_jax.window import observation
 from tests.helpers import all_moved, identical, jit, make_window, to_numpy
@@ -65,7 +64,7 @@ def make_peeks(*names, mode="joint", every=2, clip=0.0, form="separate", target_
     return init, update, Hyper(dict.fromkeys(names, np.float32(1)), RATES)
 
 
-_shift = jit(shift)
+_shift = jit(make_view("shift"))
 
 
 def test_each_augmentation_and_who_sees_it():

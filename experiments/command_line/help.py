@@ -17,7 +17,8 @@ GROUPS: dict[str, str] = {
     "Game": "game num_envs frame_size frame_stack reward_clip life_loss sticky_actions noop_max",
     "RL": "rl gamma target_encoder slow_update_every eps_train eps_final eps_anneal_steps",
     "Encoder": "encoder encoder_from heads_from",
-    "Representation": "objective augment srl_every encoder_optimizer policy_from pretrain_epsilon",
+    "Representation": "objective srl_every encoder_optimizer gate policy_from pretrain_epsilon",
+    "Views": "augment rl_view srl_view target_view",
     "Replay": "buffer_size batch_size updates_per_step learn_start beta beta_final beta_anneal_steps",
     "Optimisation": "lr_rl lr_srl lr_encoder lr_encoder_srl lr_final_share decoder_weight_decay "
     "max_grad_norm adam_eps",

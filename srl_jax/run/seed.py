@@ -308,4 +308,6 @@ class Seed:
 def _learner(state: TrainState) -> dict[str, Any]:
     """What a checkpoint holds of the learner beside its parameters."""
     learner = {name: getattr(state, name) for name in ("slow", "opt_state", "step")}
+    if state.norms is not None:  # runs of before there were ratios have none
+        learner["norms"] = state.norms
     return learner | {"key": jax.random.key_data(state.key)}
