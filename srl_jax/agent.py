@@ -166,6 +166,10 @@ def components(
     algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
     parsed = [specs.parse(text, objectives.REGISTRY, "objective") for text in config.objectives]
     terms = {spec.name: specs.build(spec, objectives.REGISTRY, context) for spec in parsed}
+    for spec in parsed:
+        given = spec.options.get(specs.WEIGHT)
+        if isinstance(given, specs.Weight) and terms[spec.name].weight is not given:
+            raise specs.SpecError(f"--objective={spec}: {spec.name} changes its weight; give a number")
     return encoder, algorithm, terms
 
 

@@ -1,6 +1,7 @@
 """The update of an agent: where losses are summed and the encoder is stepped; also how it starts and acts."""
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
@@ -259,9 +260,8 @@ def make_update(
 
         ahead = {}
         if project:
-            for names in kinds:
-                ahead[names] = differentiated(names, (*names, ENCODER), state.params)
-            of_rl, of_srl = (ahead[names][1] for names in kinds)
+            ahead = {names: differentiated(names, (*names, ENCODER), state.params) for names in kinds}
+            of_rl, of_srl = (gradients for _, gradients in ahead.values())
             of_rl[ENCODER], of_srl[ENCODER] = project(of_rl[ENCODER], of_srl[ENCODER])
         params, opt_state = state.params, state.opt_state
         losses: dict[str, Array] = {}
@@ -273,11 +273,7 @@ def make_update(
                 found = [ahead[names] for names in kinds if names[0] in one.objectives]
             else:
                 found = [differentiated(one.objectives, one.groups, state.params if one.at_start else params)]
-            (value, (own, own_extra)), grads = found[0]
-            for (other, (more, more_extra)), others in found[1:]:
-                both = jax.tree.map(jnp.add, grads[ENCODER], others[ENCODER])
-                value, own, own_extra = value + other, own | more, own_extra | more_extra
-                grads = grads | others | {ENCODER: both}
+            (value, (own, own_extra)), grads = _added(*found)
             before = {group: params[group] for group in one.groups}
             moved, moments, norms = optimizer.update(
                 grads,
@@ -312,6 +308,16 @@ def rate_of(moments: str) -> str:
     return moments if moments in (ENCODER, ENCODER_SRL, RL) else "representation"
 
 
+def _added(first: tuple, *others: tuple) -> tuple:
+    """What `jax.value_and_grad` gives of a sum, from what it gives of its parts; the encoder is in each."""
+    (value, (losses, extra)), gradients = first
+    for (more, (own, own_extra)), own_gradients in others:
+        encoder = jax.tree.map(jnp.add, gradients[ENCODER], own_gradients[ENCODER])
+        value, losses, extra = value + more, losses | own, extra | own_extra
+        gradients = gradients | own_gradients | {ENCODER: encoder}
+    return (value, (losses, extra)), gradients
+
+
 def _length_ratio(first: tuple[Params, Params], second: tuple[Params, Params]) -> Array:
     """The length of the second step, (parameters after, before), over the first's."""
     before, now = (optax.tree.norm(optax.tree.sub(*step)) for step in (first, second))
@@ -320,9 +326,8 @@ def _length_ratio(first: tuple[Params, Params], second: tuple[Params, Params]) -
 
 def _kinds(names: Iterable[str]) -> list[tuple[str, ...]]:
     """The names of the two kinds of loss, RL's and the objectives', each that there is, RL first."""
-    names = tuple(names)
-    both = (RL,) * (RL in names), tuple(name for name in names if name != RL)
-    return [kind for kind in both if kind]
+    rl_first = sorted(names, key=lambda name: name != RL)
+    return [tuple(kind) for _, kind in itertools.groupby(rl_first, key=lambda name: name == RL)]
 
 
 def follow(objectives: Mapping[str, Objective], params: Params, slow: Params, step: Array) -> Params:

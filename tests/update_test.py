@@ -6,7 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax.augment import make_view, random_shift
+from srl_jax.augment import Views, make_view, random_shift
+from srl_jax.config import Config
 from srl_jax.latents import make_latents
 from srl_jax.modes import MODES
 from srl_jax.optim import RL, make_optimizer
@@ -73,7 +74,8 @@ def test_each_augmentation_and_who_sees_it():
     assert not any(np.array_equal(*pair) for pair in zip(shifted, SMALL.frames, strict=True))
     views = {"none": (SMALL.frames, SMALL.frames), "srl": (SMALL.frames, shifted), "all": (shifted, shifted)}
     for augment, (rl_view, representation_view) in views.items():
-        init, update, hyper = make_peeks(RL, "peek", augment=augment, form="summed")
+        seen = Views.of(Config(augment=augment))
+        init, update, hyper = make_peeks(RL, "peek", views=seen, form="summed")
         _, _, metrics = jit(update)(init(key), SMALL, hyper)
         for name, view in ((RL, rl_view), ("peek", representation_view)):
             np.testing.assert_array_equal(metrics[f"{name}/frames"], view, err_msg=f"{augment} {name}")
@@ -348,8 +350,10 @@ def test_weights_must_be_those_of_the_losses():
 
 
 def test_unknown_options_are_refused():
-    with pytest.raises(ValueError, match="augment"):
-        make_update(PIXELS, {}, MODES["joint"], None, augment="both")
+    with pytest.raises(ValueError, match="gate must be one of sum, .* not both"):
+        make_update(PIXELS, {}, MODES["joint"], None, gate="both")
+    with pytest.raises(ValueError, match="no view 'both'"):
+        make_update(PIXELS, {RL: make_peek()}, MODES["joint"], None, views=Views("both"))
     with pytest.raises(ValueError, match="target_encoder"):
         make_init(PIXELS, {}, MODES["joint"], None, target_encoder="fast")
     with pytest.raises(ValueError, match="encoder_optimizer"):
