@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from unittest import mock
 
 import jax
 import numpy as np
@@ -45,7 +46,11 @@ def test_weights_by_hand(text, start, at_50, at_100, ratio):
 
 
 @pytest.mark.parametrize(
-    "text", ["ratio:", "ratio:x", "ratio:-1", "share:0.1", "1->2", "1->@5", "1->2@0", "1->2@1.5", "1->-2@5", "1@5", "->1@5", "1->inf@5"]
+    "text",
+    [
+        "ratio:", "ratio:x", "ratio:-1", "share:0.1", "1->2", "1->@5", "1->2@0", "1->2@1.5", "1->-2@5", "1@5",
+        "->1@5", "1->inf@5",
+    ],
 )  # fmt: skip
 def test_what_is_no_weight(text):
     with pytest.raises(ConfigError, match=r"^--objective=inverse:weight=.* is (not a|a)"):
@@ -124,8 +129,6 @@ def test_a_ratio_holds_the_norm_of_an_objectives_gradient_on_the_encoder():
     for name, ratio in (("far", 0.1), ("near", 0.5)):
         held = last[f"weight/{name}"] * means[name] / means[RL]
         assert held == pytest.approx(ratio, rel=1e-4)
-        # The true lengths, in the long run 3 and 1000 or 1e-4 times that of its direction.
-        assert last[f"weight/{name}"] > 0
     assert "step" not in last["norms"]
 
 
@@ -165,48 +168,53 @@ def test_a_ratio_that_nothing_was_measured_of_is_a_weight_and_zero_makes_none_of
 # Runs
 
 
-JOINT = {**SMALL, "mode": "joint", "updates_per_step": 0.25, "log_every": 20, "eval_games": 1}
-RATIO = {
-    "summed": dict(
-        objectives=("inverse:weight=ratio:0.1", "latent_l2"), encoder_optimizer="summed", srl_every=2
-    ),
-    "separate": dict(objectives=("inverse:weight=ratio:0.2->0.1@200",)),
-}
+RUN = Config(
+    **SMALL
+    | dict(
+        mode="joint", objectives=("inverse:weight=ratio:0.2->0.1@100",), srl_every=2, updates_per_step=0.5,
+        num_envs=2, learn_start=20, log_every=20, steps=80, eval_every=80, eval_games=1, eval_max_steps=30,
+    )
+)  # fmt: skip
 
 
 def rows(path):
     return [strip_wall(row) for row in read_metrics(path / "metrics.jsonl")]
 
 
-@pytest.mark.parametrize("form", RATIO)
-def test_a_run_with_ratios_resumes_bit_identically(form, tmp_path):
-    config = Config(**{**JOINT, **RATIO[form], "steps": 160, "eval_every": 160, "checkpoint_every": 80})
-    agent = make_agent(config, (42, 42, 1), 3)
-    paths = [tmp_path / name for name in ("whole", "parts")]
-    for path in paths:
-        path.mkdir()
-    loop.train(config, paths[0], progress=False, agent=agent)
+def used(path):
+    return [row["weight/inverse"] for row in rows(path) if "weight/inverse" in row]
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """(agent, directory of a whole run)."""
+    path = tmp_path_factory.mktemp("alone")
+    with mock.patch.object(jax, "jit", jit):  # compiles faster
+        agent = make_agent(RUN, (42, 42, 1), 3)
+    loop.train(RUN, path, progress=False, agent=agent)
+    return agent, path
+
+
+def test_a_run_with_ratios_resumes_bit_identically(alone, tmp_path):
+    agent, whole = alone
     seen = []
-    loop.train(config, paths[1], progress=False, agent=agent, stop=lambda: seen.append(1) or len(seen) > 22)
-    (saved,) = [checkpoint.verify(path) for path in (paths[1] / "checkpoints").iterdir() if "88" in path.name]
-    loop.train(config, paths[1], progress=False, agent=agent, resume=saved)
-    whole, parts = map(rows, paths)
-    assert whole == parts
-    used = [row["weight/inverse"] for row in whole if "weight/inverse" in row]
-    assert len(set(used)) > 2 and all(x > 0 for x in used)
+    stop = lambda: seen.append(1) or len(seen) > 28  # noqa: E731
+    loop.train(RUN, tmp_path, progress=False, agent=agent, stop=stop)
+    saved = checkpoint.read_manifest(tmp_path)
+    assert 0 < saved.updates < 30 and saved.updates % NORM_EVERY
+    loop.train(RUN, tmp_path, progress=False, agent=agent, resume=saved)
+    assert rows(whole) == rows(tmp_path)
+    assert len(set(used(whole))) == 3 and min(used(whole)) > 0
 
 
-def test_a_seed_with_a_ratio_in_company_is_the_seed_alone(tmp_path):
-    config = Config(**{**JOINT, **RATIO["separate"], "steps": 120, "eval_every": 120})
-    paths = [tmp_path / name for name in ("s3", "s7", "alone")]
+def test_a_seed_with_a_ratio_in_company_is_the_seed_alone(alone, tmp_path):
+    paths = [tmp_path / name for name in ("s0", "s7")]
     for path in paths:
         path.mkdir()
-    loop.train_seeds(config, [3, 7], paths[:2], progress=False)
-    loop.train(dataclasses.replace(config, seed=3), paths[2], progress=False)
-    together, other, alone = (
-        [row["weight/inverse"] for row in rows(p) if "weight/inverse" in row] for p in paths
-    )
-    assert together == pytest.approx(alone, rel=1e-3)
+    with mock.patch.object(jax, "jit", jit):
+        loop.train_seeds(RUN, [0, 7], paths, progress=False)
+    together, other = map(used, paths)
+    assert together == pytest.approx(used(alone[1]), rel=1e-3)
     assert together != pytest.approx(other, rel=1e-3)
 
 
