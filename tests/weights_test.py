@@ -16,7 +16,7 @@ from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.modes import MODES
 from srl_jax.optim import RL, make_optimizer
-from srl_jax.run import loop
+from srl_jax.run import loop, seed
 from srl_jax.run.schedules import Schedules
 from srl_jax.specs import Weight, parse_weight
 from srl_jax.types import Objective
@@ -205,6 +205,13 @@ def test_a_run_with_ratios_resumes_bit_identically(alone, tmp_path):
     loop.train(RUN, tmp_path, progress=False, agent=agent, resume=saved)
     assert rows(whole) == rows(tmp_path)
     assert len(set(used(whole))) == 3 and min(used(whole)) > 0
+
+
+def test_a_checkpoint_without_ratios_is_what_it_was_before_there_were_any():
+    of = lambda config: make_agent(config, (42, 42, 1), 3).shapes()  # noqa: E731
+    plain = jax.eval_shape(seed._learner, of(Config(**SMALL)))
+    assert set(plain) == {"slow", "opt_state", "step", "key"}
+    assert set(jax.eval_shape(seed._learner, of(RUN))) == {*plain, "norms"}
 
 
 def test_a_seed_with_a_ratio_in_company_is_the_seed_alone(alone, tmp_path):
