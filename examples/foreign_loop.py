@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from srl_jax import Replay, encoders, envs, losses, objectives, types, update, window
+from srl_jax import Replay, encoders, envs, latents, losses, objectives, types, window
 
 N, A, ATOMS = 8, 3, jnp.linspace(-2, 2, 31)
 conv, flat = nn.Conv(16, (6, 6), 4), lambda x: x.reshape(len(x), -1)
@@ -39,8 +39,8 @@ def learn(params: types.Params, slow: types.Params, opt_state: optax.OptState, b
         rl = jax.vmap(losses.categorical_q_learning, (0, None, 0, 0, 0, 0, 0))(
             logits(params, x_tm1), ATOMS, a_tm1, r_t, discount_t, logits(slow, x_t), values(params, x_t)
         )
-        latents = update.make_latents(encoder, params["encoder"], slow["encoder"], batch)
-        srl, _ = inverse.loss(params["inverse"], {}, latents, batch, jax.random.key(0))
+        seen = latents.make_latents(encoder, params["encoder"], slow["encoder"], batch)
+        srl, _ = inverse.loss(params["inverse"], {}, seen, batch, jax.random.key(0))
         return jnp.mean(rl * batch.weight) + 0.1 * jnp.mean(srl), rl
 
     grads, td_error = jax.grad(loss, has_aux=True)(params)

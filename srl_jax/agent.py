@@ -9,10 +9,11 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from srl_jax import encoders, objectives, rl, specs
+from srl_jax import encoders, modes, objectives, rl, specs
+from srl_jax.augment import Views
 from srl_jax.config import Config
 from srl_jax.diagnostics.functions import Functions, make_functions
-from srl_jax.modes import MODES, Mode, encoder_learning_rate, second_learning_rate
+from srl_jax.modes import Mode, encoder_learning_rate, second_learning_rate
 from srl_jax.optim import ENCODER, RL, make_optimizer
 from srl_jax.rl import Algorithm
 from srl_jax.types import Array, Context, Encoder, Objective, Params, TrainState, Window
@@ -26,6 +27,7 @@ from srl_jax.update import (
     make_update,
     passes,
 )
+from srl_jax.weights import make_norms
 
 
 class Init(Protocol):
@@ -117,6 +119,8 @@ class Agent(NamedTuple):
         update: `srl_jax.update.make_update`'s, without moving slow copies. Takes over the buffers of the
             optimizer's state, and no others: the parameters may still act while it runs.
         update_rl: the update that computes RL's loss alone, where `srl_every` asks for one; else None.
+        norms: `srl_jax.weights.make_norms`'s, to be called before every k-th update, k being
+            `srl_jax.update.NORM_EVERY`; None where no weight is a ratio.
         follow: `srl_jax.update.make_follow`'s, to be called after every `follow_every` updates.
         acting: TrainState -> the parameters that act: its own, or with the slow copies of RL's head and the
             encoder in their place, as the algorithm says.
@@ -135,6 +139,7 @@ class Agent(NamedTuple):
     init: Init
     update: Update
     update_rl: Update | None
+    norms: Callable | None
     follow: Callable[[TrainState], TrainState]
     follow_every: int
     acting: Callable[[TrainState], Params]
@@ -163,6 +168,10 @@ def components(
     algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
     parsed = [specs.parse(text, objectives.REGISTRY, "objective") for text in config.objectives]
     terms = {spec.name: specs.build(spec, objectives.REGISTRY, context) for spec in parsed}
+    for spec in parsed:
+        given = spec.options.get(specs.WEIGHT)
+        if isinstance(given, specs.Weight) and terms[spec.name].weight is not given:
+            raise specs.SpecError(f"--objective={spec}: {spec.name} changes its weight; give a number")
     return encoder, algorithm, terms
 
 
@@ -177,7 +186,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
     Raises:
         srl_jax.specs.SpecError: where a spec does not fit.
     """
-    mode = MODES[config.mode]
+    mode, views = modes.of(config), Views.of(config)
     encoder, algorithm, terms = components(config, frame_shape, num_actions)
     if not mode.representation:
         terms = {}
@@ -198,7 +207,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
     }
 
     def jitted_update(plan: Sequence[Pass]) -> Update:
-        how = partial(make_update, plan=plan, augment=config.augment, slow_follows=False)
+        how = partial(make_update, plan=plan, gate=config.gate, views=views, slow_follows=False)
         return Update(how(encoder, terms, mode, optimizer), plan)
 
     def jitted_act(noisy: bool) -> Act:
@@ -206,6 +215,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         return jax.jit(lambda params, *rest: act(params["encoder"], params[RL], *rest))
 
     plan = passes(mode, terms, config.encoder_optimizer)
+    norms = make_norms(encoder, terms, mode, optimizer, views=views)
     init = make_init(encoder, terms, mode, optimizer, plan=plan, target_encoder=config.target_encoder)
     return Agent(
         mode=mode,
@@ -217,6 +227,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         init=jax.jit(init, compiler_options={"xla_backend_optimization_level": 0}),
         update=jitted_update(plan),
         update_rl=jitted_update(passes(mode, [RL])) if config.srl_every > 1 else None,
+        norms=norms and jax.jit(norms),
         follow=jax.jit(make_follow(terms)),
         follow_every=follow_every(terms),
         acting=slow_params if algorithm.acts_slow and mode.rl else lambda state: state.params,
@@ -227,7 +238,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
             weights={name: jnp.float32(term.weight) for name, term in terms.items()},
             learning_rates={group: jnp.float32(rate) for group, rate in rates.items()},
         ),
-        measures=make_functions(encoder, terms, mode, channels=frame_shape[-1], augment=config.augment),
+        measures=make_functions(encoder, terms, mode, channels=frame_shape[-1], views=views),
     )
 
 
@@ -245,6 +256,7 @@ class Seeds(NamedTuple):
 
     Attributes:
         update, update_rl: (TrainState, [Window] of the seeds, Hyper) -> (TrainState, td_error, metrics).
+        norms: (TrainState, [Window], Hyper) -> `TrainState.norms`, or None; as the agent's.
         follow: TrainState -> TrainState.
         act: (params, [frames uint8 [N, S, H, W]], [key], step, epsilon) -> actions.
         stack: [tree of each seed] -> tree.
@@ -254,6 +266,7 @@ class Seeds(NamedTuple):
 
     update: Callable
     update_rl: Callable | None
+    norms: Callable | None
     follow: Callable
     act: Callable
     stack: Callable
@@ -274,6 +287,7 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
         return Seeds(
             update=alone(agent.update),
             update_rl=agent.update_rl and alone(agent.update_rl),
+            norms=agent.norms and alone(agent.norms),
             follow=agent.follow,
             act=lambda params, frames, keys, *now: agent.act(params, frames[0], keys[0], *now),
             stack=lambda trees: trees[0],
@@ -291,6 +305,10 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
             opt_state, params, rest, stacked(windows), hyper
         )
 
+    def norms(state: TrainState, windows: Sequence[Window], hyper: Hyper) -> Any:
+        assert agent.norms
+        return jax.vmap(inspect.unwrap(agent.norms), (0, 0, None))(state, stacked(windows), hyper)
+
     act = jax.vmap(inspect.unwrap(agent.act), in_axes=(0, 0, 0, None, None))
 
     part = jax.jit(lambda tree, i: jax.tree.map(lambda x: x[i], tree))
@@ -302,6 +320,7 @@ def over_seeds(agent: Agent, number: int) -> Seeds:
     return Seeds(
         update=agent.update.lifted(lift),
         update_rl=agent.update_rl and agent.update_rl.lifted(lift),
+        norms=agent.norms and jax.jit(norms),
         follow=jax.jit(jax.vmap(inspect.unwrap(agent.follow))),
         act=jax.jit(lambda params, frames, keys, *now: act(params, jnp.stack(frames), jnp.stack(keys), *now)),
         stack=jax.jit(stacked),

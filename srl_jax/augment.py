@@ -1,13 +1,17 @@
-"""Data augmentation: random views of a sequence of frames, and of a window."""
+"""Data augmentation: random views of a sequence of frames, and of a window; who sees which."""
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
-from srl_jax.specs import check_choice
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
+from srl_jax.plugins import Registry
+from srl_jax.specs import choices_text
 from srl_jax.types import Array, Window
-from srl_jax.window import to_unit
+from srl_jax.window import observation, to_unit
 
 
 def random_shift(frames: Array, key: Array, pad: int = 4) -> Array:
@@ -73,12 +77,27 @@ def crop_pad_crop(frames: Array, key: Array, cut: int = 4, pad: int = 4) -> Arra
     return frames
 
 
-VIEWS: dict[str, Callable[[Array, Array], Array]] = {
-    "shift": random_shift,
-    "intensity": intensity,
-    "crop_pad_crop": crop_pad_crop,
-}
+VIEWS = Registry("augment", {"shift": random_shift, "intensity": intensity, "crop_pad_crop": crop_pad_crop})
 """{name: (frames [T, H, W, C], key) -> frames}: the parts of a view, as in `shift+intensity`."""
+register = VIEWS.register
+
+EACH = "@each"
+"""Ends a view in which every observation has a draw of its own."""
+
+
+def _make_row_view(parts: str) -> Callable[[Array, Array], Array]:
+    """view: (frames [T, H, W, C], key) -> frames, of one row; `parts` as of `make_view`."""
+    names = [] if parts == "none" else parts.split("+")
+    for name in names:
+        if name not in VIEWS:
+            raise ValueError(f"no view {name!r}; {choices_text(name, [*VIEWS, 'none'])}, or several with +")
+
+    def view(frames: Array, key: Array) -> Array:
+        for i, name in enumerate(names):
+            frames = VIEWS[name](frames, jax.random.fold_in(key, i) if i else key)
+        return frames
+
+    return view
 
 
 def make_view(parts: str) -> Callable[[Window, Array], Window]:
@@ -90,15 +109,92 @@ def make_view(parts: str) -> Callable[[Window, Array], Window]:
     Raises:
         ValueError: there is no such part.
     """
-    names = [] if parts == "none" else parts.split("+")
-    for name in names:
-        check_choice("view", name, [*VIEWS, "none"])
+    row = _make_row_view(parts)
 
     def view(window: Window, key: Array) -> Window:
-        frames = window.frames
-        for i, name in enumerate(names):
-            keys = jax.random.split(jax.random.fold_in(key, i), frames.shape[0])
-            frames = jax.vmap(VIEWS[name])(frames, keys)
-        return window._replace(frames=frames)
+        if parts == "none":
+            return window
+        keys = jax.random.split(key, window.frames.shape[0])
+        return window._replace(frames=jax.vmap(row)(window.frames, keys))
 
     return view
+
+
+class Seen(NamedTuple):
+    """A view of a window that has been drawn.
+
+    Attributes:
+        window: what an objective is handed.
+        observe: (window, offset) -> the observations that are encoded, [B, H, W, S * C].
+    """
+
+    window: Window
+    observe: Callable[[Window, int | Array], jax.Array] = observation
+
+
+def make_seen(text: str) -> Callable[[Window, Array], Seen]:
+    """see: (window, key) -> Seen, pure.
+
+    Args:
+        text: `PARTS` for one draw a sequence, of a row's whole window, which the objective is handed as well
+            (an image that it predicts is a view, too); or `PARTS@each` for a draw for each observation that
+            is encoded, s_t and s_{t+n}, while the objective is handed the window as it was. An observation
+            has the same draw however often it is asked for.
+
+    Raises:
+        ValueError: there is no such part.
+    """
+    if not text.endswith(EACH):
+        view = make_view(text)
+        return lambda window, key: Seen(view(window, key))
+    row = _make_row_view(text.removesuffix(EACH))
+
+    def see(window: Window, key: Array) -> Seen:
+        def observe(window: Window, k: int | Array) -> jax.Array:
+            stacks = observation(window, k)
+            keys = jax.random.split(key, len(stacks))
+            keys = jax.vmap(jax.random.fold_in)(keys, jnp.broadcast_to(jnp.asarray(k), len(stacks)))
+            return jax.vmap(lambda stack, key: row(stack[None], key)[0])(stacks, keys)
+
+        return Seen(window, observe)
+
+    return see
+
+
+class Views(NamedTuple):
+    """What each loss sees, as texts of `make_seen`.
+
+    Where RL and the objectives see the same text, they see the same draw; otherwise draws of their own.
+
+    Attributes:
+        rl: what RL sees.
+        srl: what the representation objectives see.
+        target: under the slow encoders, and what RL sees of s_{t+n}: "same" for the view of the loss itself,
+            by the same draw, or a view with a draw of its own that all losses share.
+    """
+
+    rl: str = "none"
+    srl: str = "none"
+    target: str = "same"
+
+    @classmethod
+    def of(cls, config: Config) -> "Views":
+        """The views of a run: --rl_view and --srl_view where they are given, else what --augment says.
+
+        Raises:
+            ConfigError: there is no such view; one line that names the flag.
+        """
+        for flag in ("rl_view", "srl_view", "target_view"):
+            text = getattr(config, flag)
+            try:
+                if text and (flag, text) != ("target_view", "same"):
+                    make_seen(text)
+            except ValueError as error:
+                raise ConfigError(f"--{flag}={text}: {error}") from None
+        rl = config.rl_view or ("shift" if config.augment == "all" else "none")
+        srl = config.srl_view or ("none" if config.augment == "none" else "shift")
+        return cls(rl, srl, config.target_view or "same")
+
+
+UNCHANGED = Views()
+"""Every loss sees the window as replay has it."""

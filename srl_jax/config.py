@@ -71,12 +71,25 @@ class Config:
     objectives: tuple[str, ...] = _value(
         tuple, (),
         "representation loss, name:key=value,...; may be repeated; none stands for no loss; beside a preset, "
-        "+name:... adds a loss or replaces the one of that name, and -name leaves that one out",
+        "+name:... adds a loss or replaces the one of that name, and -name leaves that one out; weight=2, "
+        "'weight=1->0.01@200000' (linear over env steps) or weight=ratio:0.1 (a tenth of RL's gradient)",
         flag="objective",
     )  # fmt: skip
     augment: str = _value(
         str, "none", "which losses see randomly shifted frames; srl: the representation losses",
         choices=("none", "srl", "all"),
+    )  # fmt: skip
+    rl_view: str = _value(
+        str, "",
+        "what RL sees: none, or shift, intensity, crop_pad_crop, several with +, one draw a sequence; "
+        "@each behind it: a draw for each observation; empty: what --augment says",
+    )  # fmt: skip
+    srl_view: str = _value(
+        str, "", "what the representation losses see, likewise; one draw with --rl_view where both are alike"
+    )
+    target_view: str = _value(
+        str, "same",
+        "what slow encoders see, and RL of s_{t+n}, likewise, by a draw of their own; same: each loss's view",
     )  # fmt: skip
     srl_every: int = _value(
         int, 1, "representation losses are computed in every k-th update", "updates", minimum=1
@@ -87,6 +100,12 @@ class Config:
         "then the representation's own Adam on a fresh encoding, as in the thesis' code; simultaneous: both "
         "Adams take gradients at the same parameters; summed: one Adam steps on the summed loss",
         choices=modes.ENCODER_OPTIMIZERS,
+    )  # fmt: skip
+    gate: str = _value(
+        str, "sum",
+        "how the gradients of RL and representation meet in an encoder that both train; "
+        + "; ".join(f"{name}: {help}" for name, help in modes.GATES.items()),
+        choices=tuple(modes.GATES),
     )  # fmt: skip
     target_encoder: str = _value(
         str, "slow", "encoder under the target network: its slow copy, or the online encoder",

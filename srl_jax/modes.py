@@ -5,7 +5,7 @@ A mode is a row of `MODES`; the thesis' hypothesis 1 compares them.
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from srl_jax import annealing
+from srl_jax import annealing, specs
 from srl_jax.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -13,7 +13,18 @@ if TYPE_CHECKING:
 
 
 ENCODER_OPTIMIZERS = ("separate", "summed", "simultaneous")
-"""How two kinds of loss step one encoder: see `srl_jax.update.make_update`."""
+"""How two kinds of loss step one encoder: see `srl_jax.update.passes`."""
+
+GATES = {
+    "sum": "whatever the mode lets through is added up",
+    "rl_stopped": "RL's stops at the latent, which is what --mode=decoupled is",
+    "srl_stopped": "the objectives' stops there, so that they only look on",
+    "pcgrad": "where the two point apart, each loses its component along the other",
+    "orthogonal": "the objectives' loses its component along RL's, which stays as it is",
+}
+"""How the gradients of RL and of the objectives meet in an encoder that both train."""
+PROJECTING = ("pcgrad", "orthogonal")
+"""The gates that need both gradients at the same parameters."""
 
 
 class Mode(NamedTuple):
@@ -67,21 +78,39 @@ MODES = {
 }  # fmt: skip
 
 
+def of(config: "Config") -> Mode:
+    """The mode of a run, as `--gate` leaves it."""
+    mode = MODES[config.mode]
+    return mode._replace(
+        rl_trains_encoder=mode.rl_trains_encoder and config.gate != "rl_stopped",
+        representation_trains_encoder=mode.representation_trains_encoder and config.gate != "srl_stopped",
+    )
+
+
+def both_train(mode: Mode) -> bool:
+    """Whether RL and representation both train the encoder."""
+    return mode.rl_trains_encoder and mode.representation_trains_encoder
+
+
 def two_optimizers(config: "Config") -> bool:
     """Whether the encoder has an Adam of RL's and one of the representation's."""
-    mode = MODES[config.mode]
-    both = mode.rl_trains_encoder and mode.representation_trains_encoder
-    return both and config.encoder_optimizer != "summed"
+    return both_train(of(config)) and config.encoder_optimizer != "summed"
+
+
+def ratios(config: "Config") -> list[str]:
+    """The objectives whose weight is a ratio, as they are written."""
+    return [text for text in config.objectives if specs.has_ratio(text)]
 
 
 def second_learning_rate(config: "Config") -> float:
-    """`lr_encoder_srl`, or `lr_srl` where that is 0; 0 where the encoder has no second optimizer."""
-    return (config.lr_encoder_srl or config.lr_srl) if two_optimizers(config) else 0.0
+    """`lr_encoder_srl`, or `lr_srl` where that is 0; 0 without a second optimizer, or where ratios rule."""
+    ruled = not two_optimizers(config) or ratios(config)
+    return 0.0 if ruled else config.lr_encoder_srl or config.lr_srl
 
 
 def encoder_learning_rate(config: "Config") -> float:
     """`lr_encoder`, or its trainer's rate where that is 0; 0 where nobody trains the encoder."""
-    mode = MODES[config.mode]
+    mode = of(config)
     if config.lr_encoder:
         return config.lr_encoder
     if mode.rl_trains_encoder:
@@ -140,6 +169,11 @@ def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", comp
         raise ConfigError(
             f"--augment=srl: --mode={mode.name} runs no representation loss; valid here: none, all"
         )
+    for flag, runs in (("rl_view", mode.rl), ("srl_view", mode.representation)):
+        if (view := getattr(config, flag)) and not runs:
+            raise ConfigError(f"--{flag}={view}: --mode={mode.name} has no loss that sees it; leave it out")
+    _check_gate(config, mode)
+    _check_ratios(config)
     if config.lr_encoder_srl and not two_optimizers(config):
         raise ConfigError(
             f"--lr_encoder_srl={config.lr_encoder_srl}: with --mode={mode.name} and "
@@ -149,4 +183,41 @@ def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", comp
     if config.lr_encoder and mode.encoder_start == "checkpoint" and not mode.rl_trains_encoder:
         raise ConfigError(
             f"--lr_encoder={config.lr_encoder}: --mode={mode.name} never moves the encoder; give 0"
+        )
+
+
+def _check_gate(config: "Config", mode: Mode) -> None:
+    if config.gate != "sum" and not both_train(mode):
+        raise ConfigError(
+            f"--gate={config.gate}: in --mode={mode.name} RL and representation do not both train the "
+            "encoder, so that no two gradients meet; give sum, or --mode=joint"
+        )
+    if config.gate in PROJECTING and config.encoder_optimizer == "separate":
+        raise ConfigError(
+            f"--gate={config.gate}: with --encoder_optimizer=separate the second gradient is taken after "
+            "RL's step, so that the two do not meet; give --encoder_optimizer=summed or simultaneous"
+        )
+
+
+def _check_ratios(config: "Config") -> None:
+    if not (found := ratios(config)):
+        return
+    flag = f"--objective={found[0]}"
+    if not both_train(of(config)):
+        raise ConfigError(
+            f"{flag}: a ratio is to RL's gradient on the encoder, and with --mode={config.mode} and "
+            f"--gate={config.gate} RL and representation do not both train it; give a number"
+        )
+    if not two_optimizers(config):
+        return
+    if len(found) < len(config.objectives):
+        raise ConfigError(
+            f"{flag}: with --encoder_optimizer={config.encoder_optimizer} a ratio is of the length of the "
+            "second Adam's step, which all objectives share; give all of them ratios, or "
+            "--encoder_optimizer=summed"
+        )
+    if config.lr_encoder_srl:
+        raise ConfigError(
+            f"--lr_encoder_srl={config.lr_encoder_srl}: {found[0]} says how long the second Adam's step is; "
+            "give 0"
         )

@@ -15,6 +15,8 @@ ENCODER = "encoder"
 """The name of the encoder's group, and of the state of the Adam that steps it."""
 ENCODER_SRL = "encoder_srl"
 """The name of the state of the encoder's second Adam, the representation's own."""
+BETA_1, BETA_2 = 0.9, 0.999
+"""Adam's decays of the means of gradients and of their squares."""
 NOT_MEASURED = -1.0
 """In place of a norm in the updates that do not measure it."""
 
@@ -28,10 +30,13 @@ class Optimizer(NamedTuple):
             learning rates are traced scalars. Norms are {"encoder": of its gradient, `NOT_MEASURED` where
             `measure`, a traced bool, is false; "all": of the whole gradient before clipping, where there is
             clipping}: each is a pass over the gradient.
+        length: (a group's state) -> float32 scalar, the length of the step that left it, at a learning rate
+            of 1; of a state that no step has left, of the first one, which is 1 for each number.
     """
 
     init: Callable
     update: Callable
+    length: Callable
 
 
 def make_optimizer(
@@ -56,7 +61,7 @@ def make_optimizer(
         max_grad_norm: the global norm that gradients are clipped to; 0 for no clipping.
         adam_eps: Adam's epsilon.
     """
-    adam = optax.scale_by_adam(eps=adam_eps)
+    adam = optax.scale_by_adam(BETA_1, BETA_2, adam_eps)
     decays = {name for name, objective in objectives.items() if objective.is_decoder and decoder_weight_decay}
 
     def update(grads, state, params, learning_rates: dict[str, Array], measure: Array | bool = True):
@@ -79,7 +84,43 @@ def make_optimizer(
             moved[group] = jax.tree.map(lambda p, u: p - rate * u, tree, steps)  # noqa: B023
         return moved, new_state, norms
 
-    return Optimizer(lambda params: {group: adam.init(tree) for group, tree in params.items()}, update)
+    def init(params):
+        return {group: adam.init(tree) for group, tree in params.items()}
+
+    def length(state) -> Array:
+        count = jnp.maximum(state.count, 1)
+        mean = optax.tree.bias_correction(state.mu, BETA_1, count)
+        square = optax.tree.bias_correction(state.nu, BETA_2, count)
+        steps = jax.tree.map(lambda m, v: m / (jnp.sqrt(v) + adam_eps), mean, square)
+        numbers = sum(x.size for x in jax.tree.leaves(state.mu))
+        return jnp.where(state.count > 0, optax.tree.norm(steps), numbers**0.5)
+
+    return Optimizer(init, update, length)
+
+
+def pcgrad(rl: Params, srl: Params) -> tuple[Params, Params]:
+    """Both gradients, where their product is negative each less its component along the other.
+
+    Yu et al. (2020), Gradient Surgery for Multi-Task Learning, algorithm 1, with two tasks: RL, and the sum
+    of the weighted objectives. Each is projected off the other as it was, so that no order is to be drawn.
+    """
+    product = jnp.minimum(optax.tree.vdot(rl, srl), 0.0)
+    return _less(rl, product, srl), _less(srl, product, rl)
+
+
+def orthogonal(rl: Params, srl: Params) -> tuple[Params, Params]:
+    """RL's gradient as it is, and the objectives' less its component along RL's, whichever way it points."""
+    return rl, _less(srl, optax.tree.vdot(rl, srl), rl)
+
+
+def _less(gradient: Params, product: Array, other: Params) -> Params:
+    """A gradient less `product / |other|^2` times another one."""
+    share = product / jnp.maximum(optax.tree.vdot(other, other), 1e-30)
+    return jax.tree.map(lambda g, o: g - share * o, gradient, other)
+
+
+PROJECTIONS = {"pcgrad": pcgrad, "orthogonal": orthogonal}
+"""{gate: (RL's gradient on the encoder, the objectives') -> both, as the encoder's Adams see them}."""
 
 
 def measured(measure: Array | bool, function: Callable, *trees: Params) -> Array:

@@ -9,7 +9,8 @@ A file registers what it has when it is imported:
 
 `--import=my_file.py --objective=mine` imports it, and so does a module's name, `--import=my_package.losses`.
 An installed package names its rows as entry points of the groups `srl_jax.objectives`, `srl_jax.encoders`,
-`srl_jax.rl` and `srl_jax.files.loggers`; those are looked up where a name is in no registry.
+`srl_jax.rl`, `srl_jax.augment` (views) and `srl_jax.files.loggers`; those are looked up where a name is in no
+registry.
 """
 
 import functools

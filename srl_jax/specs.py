@@ -22,6 +22,9 @@ count and compute."""
 MOST_UNITS = 2**16
 """The largest size of a layer that an option may ask for."""
 
+WEIGHT = "weight"
+"""The option of an objective that may be a `Weight` where its default is a number."""
+
 KINDS = {bool: "true or false", int: "a whole number", float: "a number", str: "text"}
 
 
@@ -114,6 +117,74 @@ def parse_value(text: str, kind: type) -> bool | int | float | str:
             raise wrong
         return int(number)
     return number
+
+
+class Weight(float):
+    """The weight of an objective that is more than one number; as a float it is that of the first env step.
+
+    Attributes:
+        final: where it goes to, linearly, and then stays.
+        steps: env steps until it is there; 0 where it does not change.
+        ratio: whether it is the share of RL's gradient on the encoder that the objective's is held at, see
+            `srl_jax.weights`, and not a factor of the loss.
+    """
+
+    final: float
+    steps: int
+    ratio: bool
+
+    def __new__(cls, start: float, final: float | None = None, steps: int = 0, ratio: bool = False):
+        weight = super().__new__(cls, start)
+        weight.final, weight.steps, weight.ratio = float(start if final is None else final), steps, ratio
+        return weight
+
+    def __repr__(self) -> str:
+        """What `parse_weight` reads."""
+        changes = f"->{self.final!r}@{self.steps}" if self.steps else ""
+        return f"{'ratio:' if self.ratio else ''}{float(self)!r}{changes}"
+
+    def at(self, env_steps: int) -> float:
+        """The number after so many env steps."""
+        share = min(1.0, env_steps / self.steps) if self.steps else 0.0
+        return float(self) + (self.final - float(self)) * share
+
+    def __eq__(self, other: object) -> bool:
+        return repr(self) == repr(other)
+
+    __hash__ = float.__hash__
+
+
+def parse_weight(text: str) -> float:
+    """Reads a weight: `0.5`, `1->0.01@200000` (over env steps), `ratio:0.1` or `ratio:0.1->0.01@200000`.
+
+    Raises:
+        ValueError: it is none of these. The message is a reason to follow the value.
+    """
+    kind, colon, numbers = text.strip().rpartition(":")
+    first, arrow, rest = numbers.partition("->")
+    if not (colon or arrow):
+        return parse_value(text, float)  # type: ignore[return-value]
+    last, at, steps = rest.partition("@")
+    wrong = ValueError("not a weight: a number, 1->0.01@200000 (until that env step), or ratio: before these")
+    if kind != ("ratio" if colon else "") or bool(arrow) != bool(at):
+        raise wrong
+    try:
+        start = parse_value(first, float)
+        final, until = (parse_value(last, float), parse_value(steps, int)) if arrow else (start, 0)
+        for number in (start, final):
+            Info(float, "", minimum=0).check(number)
+        Info(int, "", minimum=1 if arrow else 0).check(until)
+    except ValueError:
+        raise wrong from None
+    return Weight(start, final, until, bool(colon))  # type: ignore[arg-type]
+
+
+def has_ratio(text: str) -> bool:
+    """Whether a specification's option `weight` is a ratio; False where it cannot be read."""
+    try:
+        return getattr(parse_weight(split(text)[1][WEIGHT]), "ratio", False)
+    except (ValueError, KeyError, SpecError):
+        return False
 
 
 def value_text(value: bool | int | float | str) -> str:
@@ -288,7 +359,8 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
         default = defaults[key]
         hint = f" (default {value_text(default)})"
         try:
-            options[key] = parse_value(value, type(default))
+            read = parse_weight if key == WEIGHT and type(default) is float else None
+            options[key] = read(value) if read else parse_value(value, type(default))
         except ValueError as error:
             raise SpecError(f"{where}: {key}={value} is {error}{hint}") from None
         if type(default) in (int, float):

@@ -77,9 +77,10 @@ def resolved(config: Config) -> Config:
 
     Raises:
         ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
-            these frames, or a logger's package is missing.
+            these frames, or there is no such view, or a logger's package is missing.
     """
     from srl_jax.agent import components
+    from srl_jax.augment import Views
     from srl_jax.files import loggers
 
     if config.imports:
@@ -91,6 +92,7 @@ def resolved(config: Config) -> Config:
     # environment's own size and its number of actions are known once it is made; any will do for that.
     size = config.frame_size or 84
     components(config, (size, size, 1), num_actions=18)
+    Views.of(config)
     return full
 
 

@@ -163,7 +163,8 @@ class Objective(NamedTuple):
         init: key -> head parameters (may be an empty dict).
         loss: (head, slow_head, latents, window, key) -> (losses [B], metrics: dict of scalars, or of [B]
             arrays for `td_error`).
-        weight: the factor of its batch mean in the sum of a pass.
+        weight: the factor of its batch mean in the sum of a pass; a `srl_jax.specs.Weight` is a schedule of
+            it, or a ratio of gradients. A factory passes on what it is given.
         horizon: how many steps after s_t it reads.
         slow: how its head's slow copy follows, (new, old, step) -> slow; None if it has none. A rule that
             changes nothing but in every k-th step may say so by an attribute `every` = k.
@@ -191,6 +192,7 @@ class TrainState(NamedTuple):
         opt_state: {group: Adam's state}: "encoder", "encoder_srl" where it has two, and each head that moves.
         step: int32, updates done.
         key: the run's key; update i uses fold_in(key, i), so it never changes.
+        norms: running means of norms, see `srl_jax.weights`; None where no weight is a ratio.
     """
 
     params: Params
@@ -198,3 +200,4 @@ class TrainState(NamedTuple):
     opt_state: Any
     step: Array
     key: Array
+    norms: Any = None

@@ -1,10 +1,9 @@
 """The update of an agent: where losses are summed and the encoder is stepped; also how it starts and acts."""
 
 import dataclasses
+import itertools
 import math
-import zlib
-from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import jax
@@ -13,11 +12,13 @@ import numpy as np
 import optax
 from jax.typing import ArrayLike
 
-from srl_jax.augment import random_shift
-from srl_jax.modes import ENCODER_OPTIMIZERS, Mode
-from srl_jax.optim import ENCODER, ENCODER_SRL, RL, Optimizer, measured, real_copy
-from srl_jax.types import Array, Encoder, Latents, Objective, Offsets, Params, TrainState, Window
-from srl_jax.window import observation, stack_last
+from srl_jax import weights
+from srl_jax.augment import UNCHANGED, Views
+from srl_jax.latents import make_losses, named_key
+from srl_jax.modes import ENCODER_OPTIMIZERS, GATES, Mode, both_train
+from srl_jax.optim import ENCODER, ENCODER_SRL, PROJECTIONS, RL, Optimizer, measured, real_copy
+from srl_jax.types import Array, Encoder, Objective, Params, TrainState, Window
+from srl_jax.window import stack_last
 
 NORM_EVERY = 10
 """k: norms of the encoder's gradients and steps, each a pass over them, are metrics of every k-th update."""
@@ -31,17 +32,12 @@ class Hyper(NamedTuple):
     """The numbers of an update that may change without compiling it again: traced float32 scalars.
 
     Attributes:
-        weights: {objective: factor of its mean loss}.
+        weights: {objective: factor of its mean loss, or the ratio where its weight is one}.
         learning_rates: {"encoder", "encoder_srl", "rl", "representation"}.
     """
 
     weights: Mapping[str, Scalar]
     learning_rates: Mapping[str, Scalar]
-
-
-def named_key(key: jax.Array, name: str) -> jax.Array:
-    """A key that depends on a name alone, so that enabling one objective never changes another's noise."""
-    return jax.random.fold_in(key, zlib.crc32(name.encode()))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,9 +133,8 @@ def passes(mode: Mode, active: Collection[str], encoder_optimizer: str = "separa
         groups = {name: name for name in names} | ({ENCODER: moments} if moves else {})
         return Pass(names, groups, at_start=encoder_optimizer == "simultaneous")
 
-    both = mode.rl_trains_encoder and mode.representation_trains_encoder and RL in active
     others = tuple(name for name in active if name != RL)
-    if encoder_optimizer == "summed" or not both or not others:
+    if encoder_optimizer == "summed" or not (both_train(mode) and RL in active and others):
         return (one(tuple(active), ENCODER),)
     return one((RL,), ENCODER), one(others, ENCODER_SRL)
 
@@ -184,6 +179,7 @@ def make_init(
             opt_state=optimizer.init({moments: params[group] for group, moments in groups}),
             step=jnp.zeros((), jnp.int32),
             key=real_copy(key),
+            norms=weights.start(objectives, two_adams=len(plan) > 1),
         )
 
     return init
@@ -196,7 +192,8 @@ def make_update(
     optimizer: Optimizer,
     *,
     plan: Sequence[Pass] | None = None,
-    augment: str = "none",
+    gate: str = "sum",
+    views: Views = UNCHANGED,
     slow_follows: bool = True,
 ) -> Callable:
     """update: (TrainState, Window, Hyper) -> (TrainState, td_error [B] | None, metrics), pure; jit it once.
@@ -212,8 +209,10 @@ def make_update(
         mode: a row of `srl_jax.modes`.
         optimizer: from `srl_jax.optim`.
         plan: the passes, see `passes`; None for those of all objectives. The heads of others do not move.
-        augment: "none"; "srl": the representation losses see a randomly shifted window; "all": every loss
-            does.
+        gate: a key of `srl_jax.modes.GATES`: how the gradients of RL and of the objectives meet in the
+            encoder where the plan has both. "pcgrad" and "orthogonal", see `srl_jax.optim.PROJECTIONS`, take
+            both at the same parameters; heads do not notice. What stops at the latent is the mode's to say.
+        views: what each loss sees.
         slow_follows: whether the slow copies move by their rules; False leaves that to `make_follow`, which
             then must be called after every `follow_every` updates: an update that never writes to the slow
             copies needs no copy of them.
@@ -226,37 +225,61 @@ def make_update(
         over the first's. Those of the encoder are `srl_jax.optim.NOT_MEASURED` but in every k-th
         update, k being `NORM_EVERY`.
     """
-    if augment not in ("none", "srl", "all"):
-        raise ValueError(f"augment must be none, srl or all, not {augment}")
-    steps = []
-    for one in passes(mode, objectives) if plan is None else plan:
-        own = {name: objectives[name] for name in one.objectives}
-        steps.append((one, make_losses(encoder, own, mode, augment=augment)))
+    if gate not in GATES:
+        raise ValueError(f"gate must be one of {', '.join(GATES)}, not {gate}")
+    plan = passes(mode, objectives) if plan is None else plan
+    kinds = _kinds(name for one in plan for name in one.objectives)
+    project = PROJECTIONS.get(gate) if len(kinds) > 1 else None
+    if project and len(plan) > 1 and not plan[1].at_start:
+        raise ValueError(f"gate {gate} takes both gradients at the same parameters: not after RL's step")
+    parts = kinds if project else [one.objectives for one in plan]
+    losses_of = {
+        names: make_losses(encoder, {name: objectives[name] for name in names}, mode, views=views)
+        for names in parts
+    }
+    of_ratios = [name for name in weights.ratios(objectives) if any(name in names for names in parts)]
 
     def update(state: TrainState, window: Window, hyper: Hyper):
         if set(hyper.weights) != set(objectives):
             raise ValueError(f"weights {sorted(hyper.weights)} for losses {sorted(objectives)}")
         measure = state.step % NORM_EVERY == 0
+        factors = weights.factors(objectives, hyper.weights, state.norms)
+        rates = hyper.learning_rates
+        if of_ratios and len(plan) > 1:
+            ratios = {name: hyper.weights[name] for name in of_ratios}
+            rates = {**rates, ENCODER_SRL: weights.second_rate(ratios, state.norms, rates[ENCODER])}
+
+        def differentiated(names: tuple[str, ...], groups: Collection[str], at: Params) -> tuple:
+            """((weighted sum, (losses, metrics)), gradients) of the losses of these names."""
+
+            def total(moving: Params):
+                losses, extra = losses_of[names](at | moving, state, window)
+                return sum(factors[name] * jnp.mean(losses[name]) for name in losses), (losses, extra)
+
+            return jax.value_and_grad(total, has_aux=True)({group: at[group] for group in groups})
+
+        ahead = {}
+        if project:
+            ahead = {names: differentiated(names, (*names, ENCODER), state.params) for names in kinds}
+            of_rl, of_srl = (gradients for _, gradients in ahead.values())
+            of_rl[ENCODER], of_srl[ENCODER] = project(of_rl[ENCODER], of_srl[ENCODER])
         params, opt_state = state.params, state.opt_state
         losses: dict[str, Array] = {}
         extra: dict[str, dict[str, Array]] = {}
         metrics: dict[str, Any] = {"loss/total": 0.0}
         lengths: list[tuple[Params, Params]] = []
-        for one, losses_of in steps:
-            at = state.params if one.at_start else params
-
-            def total(moving: Params):
-                losses, extra = losses_of(at | moving, state, window)  # noqa: B023
-                return sum(hyper.weights[name] * jnp.mean(losses[name]) for name in losses), (losses, extra)
-
-            moving = {group: at[group] for group in one.groups}
-            (value, (own, own_extra)), grads = jax.value_and_grad(total, has_aux=True)(moving)
+        for one in plan:
+            if project:
+                found = [ahead[names] for names in kinds if names[0] in one.objectives]
+            else:
+                found = [differentiated(one.objectives, one.groups, state.params if one.at_start else params)]
+            (value, (own, own_extra)), grads = _added(*found)
             before = {group: params[group] for group in one.groups}
             moved, moments, norms = optimizer.update(
                 grads,
                 {group: opt_state[name] for group, name in one.groups.items()},
                 before,
-                {group: hyper.learning_rates[rate_of(name)] for group, name in one.groups.items()},
+                {group: rates[rate_of(name)] for group, name in one.groups.items()},
                 measure,
             )
             params = params | moved
@@ -265,16 +288,17 @@ def make_update(
             metrics |= {f"grad_norm/{group}{suffix}": norm for group, norm in norms.items()}
             metrics["loss/total"] += value
             losses, extra = losses | own, extra | own_extra
-            if len(steps) > 1:
+            if len(plan) > 1:
                 lengths.append((moved[ENCODER], before[ENCODER]))
         if lengths:
             metrics["step_ratio/encoder"] = measured(measure, _length_ratio, *lengths)
         step = state.step + 1
         td_error = extra.get(RL, {}).pop("td_error", None)
+        metrics |= {f"weight/{name}": factors[name] for name in of_ratios}
         metrics |= {f"loss/{name}": jnp.mean(x) for name, x in losses.items()}
         metrics |= {f"{name}/{k}": x for name, values in extra.items() for k, x in values.items()}
         slow = follow(objectives, params, state.slow, step) if slow_follows else state.slow
-        return TrainState(params, slow, opt_state, step, state.key), td_error, metrics
+        return TrainState(params, slow, opt_state, step, state.key, state.norms), td_error, metrics
 
     return update
 
@@ -284,49 +308,26 @@ def rate_of(moments: str) -> str:
     return moments if moments in (ENCODER, ENCODER_SRL, RL) else "representation"
 
 
+def _added(first: tuple, *others: tuple) -> tuple:
+    """What `jax.value_and_grad` gives of a sum, from what it gives of its parts; the encoder is in each."""
+    (value, (losses, extra)), gradients = first
+    for (more, (own, own_extra)), own_gradients in others:
+        encoder = jax.tree.map(jnp.add, gradients[ENCODER], own_gradients[ENCODER])
+        value, losses, extra = value + more, losses | own, extra | own_extra
+        gradients = gradients | own_gradients | {ENCODER: encoder}
+    return (value, (losses, extra)), gradients
+
+
 def _length_ratio(first: tuple[Params, Params], second: tuple[Params, Params]) -> Array:
     """The length of the second step, (parameters after, before), over the first's."""
     before, now = (optax.tree.norm(optax.tree.sub(*step)) for step in (first, second))
     return now / jnp.maximum(before, 1e-30)
 
 
-def make_losses(
-    encoder: Encoder,
-    objectives: Mapping[str, Objective],
-    mode: Mode,
-    *,
-    augment: str,
-) -> Callable:
-    """losses: (params, TrainState, Window) -> ({name: losses [B]}, {name: metrics}), pure; see `make_update`.
-
-    Everything but the parameters comes from the state: slow copies, and the key of the update that is next.
-    """
-
-    def losses_of(params: Params, state: TrainState, window: Window):
-        key = jax.random.fold_in(state.key, state.step)
-        shifted = window if augment == "none" else shift(window, named_key(key, "augment"))
-        rl_view = window if augment == "srl" else shifted
-        seen = encoded(encoder, params["encoder"], shifted)
-        rl_seen = seen if rl_view is shifted else encoded(encoder, params["encoder"], rl_view)
-        losses, metrics = {}, {}
-        for name, objective in objectives.items():
-            view, online, opens = shifted, seen, mode.representation_trains_encoder
-            if name == RL:
-                view, online, opens = rl_view, rl_seen, mode.rl_trains_encoder
-            own = state.slow.get(name, {"encoder": {}, "head": None})
-            lagged = own["encoder"] if jax.tree.leaves(own["encoder"]) else params["encoder"]
-            of = partial(make_latents, encoder, params["encoder"], lagged)
-            latents = Latents(online, frozen(encoded(encoder, lagged, view)), of)
-            losses[name], metrics[name] = objective.loss(
-                params[name],
-                own["head"],
-                latents if opens else shut(latents),
-                view,
-                named_key(key, name),
-            )
-        return losses, metrics
-
-    return losses_of
+def _kinds(names: Iterable[str]) -> list[tuple[str, ...]]:
+    """The names of the two kinds of loss, RL's and the objectives', each that there is, RL first."""
+    rl_first = sorted(names, key=lambda name: name != RL)
+    return [tuple(kind) for _, kind in itertools.groupby(rl_first, key=lambda name: name == RL)]
 
 
 def follow(objectives: Mapping[str, Objective], params: Params, slow: Params, step: Array) -> Params:
@@ -337,63 +338,6 @@ def follow(objectives: Mapping[str, Objective], params: Params, slow: Params, st
         lagged = params["encoder"] if jax.tree.leaves(old["encoder"]) else {}
         moved[name] = rules[name]({"encoder": lagged, "head": params[name]}, old, step)
     return moved
-
-
-def shift(window: Window, key: Array) -> Window:
-    """The window, each row shifted by its own draw."""
-    keys = jax.random.split(key, window.frames.shape[0])
-    return window._replace(frames=jax.vmap(random_shift)(window.frames, keys))
-
-
-def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window) -> Latents:
-    """Latents of a window under two encoders' parameters; none with gradient under the slow ones."""
-    of = partial(make_latents, encoder, params, slow)
-    return Latents(encoded(encoder, params, window), frozen(encoded(encoder, slow, window)), of)
-
-
-def encoded(encoder: Encoder, params: Params, window: Window) -> Callable[[Offsets], jax.Array]:
-    """offset -> latents, list of offsets -> latents of each: what `Latents` says of one encoder."""
-    known: dict[Hashable, tuple[jax.Array, Mapping[Hashable, int | Array]]] = {}
-
-    def latent(k: Offsets) -> jax.Array:
-        several = isinstance(k, Sequence)
-        asked = k if isinstance(k, Sequence) else (k,)
-        identities = [_identity(offset) for offset in asked]
-        offsets = dict(zip(identities, asked, strict=True))
-        index = several, *offsets
-        if index not in known:  # the offsets are kept too, so that their ids stay their own
-            views = [observation(window, offset) for offset in offsets.values()]
-            z = encoder.apply(params, jnp.concatenate(views) if several else views[0])
-            known[index] = z, offsets
-        z, _ = known[index]
-        if not several:
-            return z
-        z = z.reshape(len(offsets), -1, *z.shape[1:])
-        if len(offsets) == len(identities):
-            return z
-        places = list(offsets)
-        return z[np.array([places.index(identity) for identity in identities])]
-
-    return latent
-
-
-def _identity(offset: int | Array) -> Hashable:
-    """What two offsets that are known to be equal have in common."""
-    if isinstance(offset, int):
-        return offset
-    if isinstance(offset, jax.core.Tracer):
-        return "tracer", id(offset)
-    return np.shape(offset), np.asarray(offset).tobytes()
-
-
-def frozen(latent: Callable[[Offsets], jax.Array]) -> Callable[[Offsets], jax.Array]:
-    """The same latents without gradient."""
-    return lambda k: jax.lax.stop_gradient(latent(k))
-
-
-def shut(latents: Latents) -> Latents:
-    """The same latents without gradient: an objective that does not train the encoder."""
-    return Latents(frozen(latents.online), latents.slow, lambda window: shut(latents.of(window)))
 
 
 def make_act(encoder: Encoder, q_values: Callable, *, noisy: bool) -> Callable:

@@ -139,7 +139,7 @@ def test_values_that_are_refused(values, message):
     [
         ("{", "not JSON"),
         ("[]", "not a JSON object"),
-        ('{"gmae": "Pong"}', "did you mean game?"),
+        ('{"gamee": "Pong"}', "did you mean game?"),
         ('{"steps": 1.5}', "--steps=1.5"),
         ('{"gamma": NaN}', "--gamma=nan"),
         ('{"gamma": 1' + "0" * 400 + "}", "--gamma=1000"),
@@ -282,6 +282,11 @@ def test_a_mode_takes_the_encoder_and_the_objectives_that_it_needs(mode):
         ({"mode": "rl_only", "policy_from": "x"}, "--policy_from=x: only --mode=pretrain"),
         ({"mode": "rl_only", "augment": "srl"}, "--augment=srl: --mode=rl_only"),
         ({"mode": "frozen", "encoder_from": "x", "lr_encoder": 1.0}, "--lr_encoder=1.0"),
+        (
+            {"mode": "rl_only", "srl_view": "shift"},
+            "--srl_view=shift: --mode=rl_only has no",
+        ),
+        ({"mode": "pretrain", "objectives": ("a",), "rl_view": "shift"}, "--rl_view=shift: --mode=pretrain"),
     ],
 )
 def test_settings_that_a_mode_ignores_are_refused(values, message):

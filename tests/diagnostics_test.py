@@ -205,7 +205,7 @@ def test_gradient_conflict_of_losses_whose_gradients_are_known():
     hyper = Hyper({RL: np.float32(1), "same": np.float32(4), "against": np.float32(1)}, {})
     # In mode decoupled RL's gradient does not enter the encoder; this is the one that it would be.
     for mode in ("joint", "decoupled"):
-        conflict = jit(make_conflict(encoder, terms, MODES[mode], augment="none"))
+        conflict = jit(make_conflict(encoder, terms, MODES[mode]))
         found = {
             name: [float(x) for x in pair] for name, pair in conflict(state, make_window(), hyper).items()
         }
@@ -220,7 +220,7 @@ def test_an_image_of_two_latents_is_left_out_and_told():
         return latents.online(1), decoder.apply(head, latents.online(0))
 
     terms = {"one": objective(1.0)._replace(image=later, horizon=1)}
-    functions = make_functions(encoder, terms, MODES["pretrain"], channels=1, augment="none")
+    functions = make_functions(encoder, terms, MODES["pretrain"], channels=1)
     assert functions.decode == {} and functions.others == ("one",) and functions.conflict is None
 
 

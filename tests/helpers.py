@@ -135,6 +135,7 @@ def random_state(init, seed: int = 0) -> TrainState:
         opt_state=jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes.opt_state),
         step=np.int32(0),
         key=jax.random.key(seed),
+        norms=jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes.norms),
     )
 
 

@@ -6,6 +6,7 @@ import pytest
 
 from srl_jax import encoders, objectives
 from srl_jax.envs import make
+from srl_jax.latents import make_latents
 from srl_jax.modes import MODES
 from srl_jax.objectives.forward_pixels import ActionGate
 from srl_jax.objectives.reconstruction import (
@@ -18,7 +19,7 @@ from srl_jax.objectives.reconstruction import (
 )
 from srl_jax.optim import make_optimizer
 from srl_jax.types import Context, Window
-from srl_jax.update import Hyper, make_init, make_latents, make_update
+from srl_jax.update import Hyper, make_init, make_update
 from srl_jax.window import image
 from tests import helpers
 from tests.helpers import (

@@ -19,7 +19,8 @@ GROUPS: dict[str, str] = {
     "eps_anneal_steps",
     "Resets": "reset reset_every reset_last shrink",
     "Encoder": "encoder encoder_from heads_from",
-    "Representation": "objective augment srl_every encoder_optimizer policy_from pretrain_epsilon",
+    "Representation": "objective srl_every encoder_optimizer gate policy_from pretrain_epsilon",
+    "Views": "augment rl_view srl_view target_view",
     "Replay": "buffer_size batch_size updates_per_step learn_start beta beta_final beta_anneal_steps",
     "Optimisation": "lr_rl lr_srl lr_encoder lr_encoder_srl lr_final_share decoder_weight_decay "
     "weight_decay max_grad_norm adam_eps",

@@ -7,10 +7,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from srl_jax import weights
+from srl_jax.augment import UNCHANGED, Views
+from srl_jax.latents import make_encoder_gradient
 from srl_jax.modes import Mode
 from srl_jax.optim import RL
 from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
-from srl_jax.update import Hyper, make_losses
+from srl_jax.update import Hyper
 from srl_jax.window import stack_last
 
 
@@ -43,15 +46,15 @@ def make_functions(
     mode: Mode,
     *,
     channels: int,
-    augment: str,
+    views: Views = UNCHANGED,
 ) -> Functions:
-    """The functions of an agent; C is `channels`, `augment` as of `srl_jax.update.make_update`."""
+    """The functions of an agent; C is `channels`, `views` as of `srl_jax.update.make_update`."""
     images = {name: objective.image for name, objective in objectives.items() if objective.image}
     decode = {name: _decode(image) for name, image in images.items()}
     ready = {n: f for n, f in decode.items() if _enough(f, objectives[n], encoder, channels)}
     conflict = None
     if mode.rl and mode.representation and len(objectives) > 1 and RL in objectives:
-        conflict = jax.jit(make_conflict(encoder, objectives, mode, augment=augment))
+        conflict = jax.jit(make_conflict(encoder, objectives, mode, views=views))
     return Functions(
         encode=jax.jit(lambda params, frames: encoder.apply(params, stack_last(frames))),
         decode={name: jax.jit(function) for name, function in ready.items()},
@@ -65,31 +68,24 @@ def make_conflict(
     objectives: Mapping[str, Objective],
     mode: Mode,
     *,
-    augment: str,
+    views: Views = UNCHANGED,
 ) -> Callable:
     """conflict: (TrainState, Window, Hyper) -> {name: (cosine, norm ratio)}, pure; for each but RL.
 
     The cosine of an objective's gradient on the encoder's parameters with RL's, and its norm over RL's norm,
-    both gradients of `weight * mean(losses)`. Every loss's gradient enters the encoder here, whatever the
-    mode: in mode decoupled it is the gradient that RL's would be.
+    both gradients of `weight * mean(losses)`, with the weight that a ratio is at that moment. Every
+    loss's gradient enters the encoder here, whatever the mode: in mode decoupled it is the gradient that RL's
+    would be.
     """
-    both = mode._replace(rl_trains_encoder=True, representation_trains_encoder=True)
+    gradient = make_encoder_gradient(encoder, objectives, mode, views=views)
 
     def conflict(state: TrainState, window: Window, hyper: Hyper):
-        def gradient(name: str) -> Params:
-            losses_of = make_losses(encoder, {name: objectives[name]}, both, augment=augment)
-
-            def loss(tree: Params) -> Array:
-                losses, _ = losses_of({**state.params, "encoder": tree}, state, window)
-                return hyper.weights[name] * jnp.mean(losses[name])
-
-            return jax.grad(loss)(state.params["encoder"])
-
-        of_rl = gradient(RL)
+        factors = weights.factors(objectives, hyper.weights, state.norms)
+        of_rl = gradient(RL, factors[RL], state, window)
         norm = optax.tree.norm(of_rl)
         found = {}
         for name in sorted(objectives.keys() - {RL}):
-            other = gradient(name)
+            other = gradient(name, factors[name], state, window)
             other_norm = optax.tree.norm(other)
             found[name] = optax.tree.vdot(of_rl, other) / (norm * other_norm), other_norm / norm
         return found

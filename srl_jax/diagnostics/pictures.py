@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from srl_jax.agent import Agent
+from srl_jax.latents import make_latents
 from srl_jax.replay import Replay
-from srl_jax.update import make_latents
 
 PICTURES = 6
 """Examples in the picture of what an objective learnt."""

@@ -29,7 +29,7 @@ from srl_jax.run.ending import Ending
 from srl_jax.run.schedules import Now, Schedules, passed
 from srl_jax.run.seed import Seed
 from srl_jax.types import Params
-from srl_jax.update import named_key
+from srl_jax.update import NORM_EVERY, named_key
 
 FETCH_EVERY = 100
 """Updates after which their metrics are fetched from the device, so that few wait there between two rows."""
@@ -138,7 +138,7 @@ class Run:
             Seed(own, Path(out), self.agent, env, progress and i == 0)
             for i, (own, out, env) in enumerate(zip(configs, outs, envs, strict=True))
         ]
-        self.schedules = Schedules(config, self.agent.hyper)
+        self.schedules = Schedules(config, self.agent.hyper, self.agent.objectives)
         self.act_keys = [named_key(seed.key, "act") for seed in self.seeds]
         if policy := given_policy(config, frame, num_actions):
             for seed in self.seeds:
@@ -274,6 +274,9 @@ class Run:
         """One update, from sampling windows to setting their priorities; waits for the device."""
         _, beta, hyper, own = self.now
         sampled = [seed.replay.sample(self.config.batch_size, beta, **own) for seed in self.seeds]
+        if self.device.norms and self.updates % NORM_EVERY == 0:
+            windows = [window for window, _ in sampled]
+            self.state = self.state._replace(norms=self.device.norms(self.state, windows, hyper))
         both, rl_alone = self.device.update, self.device.update_rl
         update = rl_alone if rl_alone and self.updates % self.config.srl_every else both
         self.state, td_errors, metrics = update(self.state, [window for window, _ in sampled], hyper)
@@ -318,10 +321,12 @@ class Run:
         """A "train" row of each seed: schedules, and means since the last one."""
         self.fetch()
         epsilon, beta, *_ = self.now
-        changes = self.schedules.row(self.env_steps, self.updates)
+        weights = self.schedules.weights(self.env_steps)
+        own = {"epsilon": epsilon, "beta": beta, **{f"weight/{name}": x for name, x in weights.items()}}
+        own |= self.schedules.row(self.env_steps, self.updates)
         for seed in self.seeds:
-            values = {"epsilon": epsilon, "beta": beta, "replay/transitions": len(seed.replay)}
-            seed.report.train_row(self.env_steps, self.updates, values | changes)
+            values = {**own, "replay/transitions": len(seed.replay)}
+            seed.report.train_row(self.env_steps, self.updates, values)
 
     def start_evaluation(self) -> None:
         """Measures the latents of now, and has the policies of now evaluated while training goes on."""

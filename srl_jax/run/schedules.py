@@ -1,6 +1,6 @@
 """Schedules: what changes with env steps and updates, as functions of a configuration and these counts."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,6 +9,8 @@ from srl_jax import annealing
 from srl_jax.config import Config
 from srl_jax.modes import MODES
 from srl_jax.run.actor import linear
+from srl_jax.specs import Weight
+from srl_jax.types import Objective
 from srl_jax.update import Hyper
 
 
@@ -34,10 +36,13 @@ class Schedules:
     Args:
         config: of the run.
         hyper: the numbers of an update, with learning rates as they are at the start.
+        objectives: by name; of those with a weight that changes.
     """
 
-    def __init__(self, config: Config, hyper: Hyper):
+    def __init__(self, config: Config, hyper: Hyper, objectives: Mapping[str, Objective] = {}):
         self._config, self._hyper = config, hyper
+        weights = {name: objective.weight for name, objective in objectives.items()}
+        self._weights = {name: x for name, x in weights.items() if isinstance(x, Weight) and x.steps}
         self._rates = {name: float(rate) for name, rate in hyper.learning_rates.items()}
         self._n = annealing.parse(config.n_anneal, int) if config.n_anneal else None
         self._gamma = annealing.parse(config.gamma_anneal, float) if config.gamma_anneal else None
@@ -46,7 +51,7 @@ class Schedules:
         """The numbers at an env step, of the update that comes after so many.
 
         Without RL, epsilon is 1 or, of a given policy, `pretrain_epsilon`. Learning rates fall linearly to
-        `lr_final_share` of what they were.
+        `lr_final_share` of what they were, and weights that change to where they go.
         """
         c, hyper = self._config, self._hyper
         epsilon = linear(c.eps_train, c.eps_final, c.eps_anneal_steps, env_steps)
@@ -56,6 +61,9 @@ class Schedules:
             left = linear(1.0, c.lr_final_share, c.steps, env_steps)
             rates = {name: np.float32(rate * left) for name, rate in self._rates.items()}
             hyper = hyper._replace(learning_rates=rates)
+        if self._weights:
+            changed = {name: np.float32(x.at(env_steps)) for name, x in self._weights.items()}
+            hyper = hyper._replace(weights={**hyper.weights, **changed})
         beta = linear(c.beta, c.beta_final, c.beta_anneal_steps, env_steps)
         return Now(epsilon, beta, hyper, self._annealed(env_steps, updates))
 
@@ -87,6 +95,10 @@ class Schedules:
         began = env_steps - self._config.num_envs
         found = self._annealed(began, updates)
         return found if self._config.reset == "none" else found | {"resets": self.resets(began)}
+
+    def weights(self, env_steps: int) -> dict[str, float]:
+        """The factors of the losses whose weight changes; an update says what a ratio's is."""
+        return {name: x.at(env_steps) for name, x in self._weights.items() if not x.ratio}
 
     def updates_due(self, env_steps: int) -> int:
         """Updates that are due by the end of the step that starts then, since the start of the run.

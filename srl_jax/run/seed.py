@@ -311,4 +311,6 @@ class Seed:
         learner = {name: getattr(state, name) for name in ("slow", "opt_state", "step")}
         if self.agent.acting(state) is not state.params:
             learner["params"] = state.params
+        if state.norms is not None:  # runs of before there were ratios have none
+            learner["norms"] = state.norms
         return learner | {"key": jax.random.key_data(state.key)}
