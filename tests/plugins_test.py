@@ -22,6 +22,7 @@ from srl_jax.plugins import Registry, load, located
 from srl_jax.specs import parse
 from tests.helpers import SMALL, write_run
 
+pytestmark = pytest.mark.usefixtures("shared_agents")
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 
 MINE = """
