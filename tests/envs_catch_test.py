@@ -2,7 +2,6 @@
 
 import hashlib
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from srl_jax import encoders, envs
 from srl_jax.envs import catch
 from srl_jax.envs.games import BACKGROUNDS
+from tests.helpers import jit, random_params
 
 LEFT, NOOP, RIGHT = range(3)
 BOTH = pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
@@ -135,8 +135,7 @@ def test_every_encoder_sees_the_paddle(name, size):
     # A VALID convolution with a stride may leave out the last rows of an image. The paddle once lay there.
     env = envs.make("Catch", num_envs=1, seed=0, frame_size=size)
     encoder = encoders.REGISTRY[name]((size, size, 4))
-    params = jax.jit(encoder.init)(jax.random.key(0))
-    apply = jax.jit(encoder.apply)
+    params, apply = random_params(encoder.init), jit(encoder.apply)
     latents = []
     for paddle in (30, 40):
         put(env, ball_x=50, ball_y=20, drift=0, fall=3, paddle=paddle)

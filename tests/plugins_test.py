@@ -205,12 +205,6 @@ def test_nothing_is_imported_from_a_run_directory(tmp_path):
                 function(str(path))
 
 
-def test_plugins_import_no_jax():
-    code = "import sys, srl_jax.plugins; sys.exit('jax' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT).returncode == 0
-    assert plugins.Registry
-
-
 # Programs
 
 
