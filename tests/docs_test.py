@@ -85,13 +85,16 @@ def _parse(monkeypatch, module, commands):
 
     def parse_all(main, positional=None):
         for arguments in commands:
-            config_flags.parse([module, *arguments], copy.deepcopy(values), positional)
+            config_flags.parse([module, *arguments], copy.deepcopy(flags.FLAGS), positional)
         parsed.append(module)
 
-    values, parsed = flags.FlagValues(), []
-    monkeypatch.setattr(flags, "FLAGS", values)
+    others, parsed = set(flags.FLAGS), []
     monkeypatch.setattr(config_flags, "run", parse_all)
-    runpy.run_module(module, run_name="__main__")
+    try:
+        runpy.run_module(module, run_name="__main__")
+    finally:
+        for name in set(flags.FLAGS) - others:
+            delattr(flags.FLAGS, name)
     assert parsed == [module]
 
 
