@@ -1,0 +1,1 @@
+"""Runs read from disk, and which of them may be compared."""
