@@ -17,7 +17,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.modes import MODES
 
 from .. import packing
-from .run_data import (RunData, arm_name, in_order, load_run, run_directories)
+from .run_data import RunData, arm_name, in_order, load_run, run_directories
 
 RETURN = "eval/return_mean"
 """The key of learning curves."""

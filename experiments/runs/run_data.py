@@ -8,12 +8,12 @@ from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from srl_jax import config
-from srl_jax.run import ending
 from srl_jax.config import Config
 from srl_jax.diagnostics.drift import STEPS, drift_matrix, drift_names
-from srl_jax.run.ending import Ending
 from srl_jax.errors import ConfigError
-from srl_jax.files.metrics import (KINDS, read_metrics)
+from srl_jax.files.metrics import KINDS, read_metrics
+from srl_jax.run import ending
+from srl_jax.run.ending import Ending
 from srl_jax.specs import LIMITS
 
 
