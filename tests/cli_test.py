@@ -269,11 +269,3 @@ def test_the_entry_point_refuses_a_device_in_one_line(tmp_path):
     assert (done.returncode, done.stdout) == (2, "") and done.stderr.count("\n") == 1
     assert done.stderr.startswith("error: JAX_PLATFORMS=nonsense: jax finds no such device (")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_nothing_that_is_checked_first_imports_jax():
-    code = (
-        "import sys, experiments.train, srl_jax.config, srl_jax.modes, srl_jax.specs; "
-        "print([m for m in ('jax', 'flax', 'gymnasium', 'ale_py') if m in sys.modules])"
-    )
-    assert python("-c", code).stdout.strip() == "[]"

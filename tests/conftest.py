@@ -39,3 +39,12 @@ def loop(monkeypatch):
     monkeypatch.setitem(sys.modules, "srl_jax.run.loop", stub)
     monkeypatch.setattr(srl_jax.run, "loop", stub, raising=False)
     return stub
+
+
+@pytest.fixture(scope="module")
+def shared_agents():
+    """Runs of a module whose agents are alike compile them once; nothing that is timed or learns for long."""
+    from tests import helpers
+
+    with helpers.shared_agents():
+        yield

@@ -246,7 +246,7 @@ def test_held_out_observations_are_the_games_and_know_its_state():
     assert np.array_equal(nexts.frames[:, 3], held_out.observations[:, -1])
 
 
-@pytest.mark.parametrize("horizon", [7, 20, 60])
+@pytest.mark.parametrize("horizon", [7, 60])
 def test_held_out_windows_may_reach_far(horizon):
     config = Config(**SMALL)
     near, far = heldout.collect(config, 3), heldout.collect(config, horizon)
@@ -265,7 +265,6 @@ def test_held_out_windows_may_reach_far(horizon):
     [
         ("Catch", 1, "46585e8483e86271"),
         ("Catch", 3, "6ddf0b23c83d56e5"),
-        ("Pong", 1, "f98af6e98d4306ee"),
         ("Pong", 3, "2609b23b597fc8ad"),
     ],
 )

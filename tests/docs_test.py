@@ -1,19 +1,21 @@
 """What the documentation says: links lead somewhere, commands parse, registries are complete, code works."""
 
 import collections
+import copy
 import json
 import re
+import runpy
 import shlex
-import subprocess
-import sys
 from importlib.util import find_spec
 from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import pytest
+from absl import flags
 
 from experiments import arms
+from experiments.command_line import flags as config_flags
 from experiments.command_line.cli import COMMANDS
 from srl_jax import encoders, envs, modes, objectives, rl
 from srl_jax.plugins import Registry
@@ -23,24 +25,6 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "WORKSPACE.md", ROOT / "CONTRIBUTING.md", *sorted(ROOT.glob("docs/*.md"))]
 BLOCK = re.compile(r"^```(\w*)\n(.*?)^```", re.MULTILINE | re.DOTALL)
 COMMAND = re.compile(r"(?:srun )?(python -m experiments\.\S+|srl-jax )")
-
-PARSE = """
-import copy, json, runpy, sys
-from absl import flags
-from experiments.command_line import flags as config_flags
-
-module, commands = sys.argv[1:]
-
-def parse_all(main, positional=None):
-    for arguments in json.loads(commands):
-        print(arguments, file=sys.stderr)
-        config_flags.parse([module, *arguments], copy.deepcopy(flags.FLAGS), positional)
-    print("parsed")
-
-config_flags.run = parse_all
-runpy.run_module(module, run_name="__main__")
-"""
-"""Defines the flags of a module and parses command lines with them, in place of running it."""
 
 
 def _text(page):
@@ -96,27 +80,40 @@ def test_every_page_can_be_reached_from_the_readme():
     assert {ROOT / link for link in links} == set(ROOT.glob("docs/*.md"))
 
 
+def _parse(monkeypatch, module, commands):
+    """Defines the flags of a module and parses command lines with them, in place of running it."""
+
+    def parse_all(main, positional=None):
+        for arguments in commands:
+            config_flags.parse([module, *arguments], copy.deepcopy(flags.FLAGS), positional)
+        parsed.append(module)
+
+    others, parsed = set(flags.FLAGS), []
+    monkeypatch.setattr(config_flags, "run", parse_all)
+    try:
+        runpy.run_module(module, run_name="__main__")
+    finally:
+        for name in set(flags.FLAGS) - others:
+            delattr(flags.FLAGS, name)
+    assert parsed == [module]
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
 @pytest.mark.parametrize("module", sorted(_by_module()))
-def test_commands_parse(module):
+def test_commands_parse(module, monkeypatch):
     folder = (ROOT / "experiments" / module).is_dir()
     spec = find_spec(f"experiments.{module}{'.__main__' if folder else ''}")
     source = Path(spec.origin).read_text(encoding="utf-8")
     if "config_flags.run(" not in source:
         pytest.skip("it has no flags")
-    arguments = json.dumps(_by_module()[module])
-    done = subprocess.run(
-        [sys.executable, "-c", PARSE, f"experiments.{module}", arguments],
-        cwd=ROOT, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert (done.returncode, done.stdout) == (0, "parsed\n"), done.stderr
+    _parse(monkeypatch, f"experiments.{module}", _by_module()[module])
 
 
-def test_an_unknown_flag_is_found():
-    done = subprocess.run(
-        [sys.executable, "-c", PARSE, "experiments.draw", '[["--run=x"], ["--nothing=1"]]'],
-        cwd=ROOT, capture_output=True, text=True, timeout=120,
-    )  # fmt: skip
-    assert done.returncode == 2 and "--nothing: no such flag" in done.stderr
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
+def test_an_unknown_flag_is_found(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        _parse(monkeypatch, "experiments.draw", [["--run=x"], ["--nothing=1"]])
+    assert ended.value.code == 2 and "--nothing: no such flag" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 import hashlib
 
-import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from srl_jax import encoders, envs
 from srl_jax.envs import catch
 from srl_jax.envs.games import BACKGROUNDS
+from tests.helpers import jit, random_params
 
 LEFT, NOOP, RIGHT = range(3)
 BOTH = pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
@@ -77,17 +77,6 @@ def test_a_hand_worked_game():
     assert ends == [False, False, True]
 
 
-@pytest.mark.parametrize(("paddle", "reward"), [(43, 1), (57, 1), (42, -1), (58, -1)])
-def test_a_catch_is_one_shared_column(paddle, reward):
-    # The ball covers columns 49 to 51. A paddle at 43 covers 37 to 49, one at 42 up to 48.
-    env = envs.make("Catch", num_envs=1, seed=0)
-    put(env, ball_x=50, ball_y=70, drift=0, fall=4, paddle=paddle)
-    frames, rewards, terminated, _, _ = env.step(np.array([NOOP]))
-    assert rewards[0] == reward and terminated[0]
-    shared = (frames[0, 75] > 0) & (frames[0, 76] > 0)
-    assert shared.any() == (reward == 1)
-
-
 def test_left_wall_and_paddle_at_the_left():
     env = envs.make("Catch", num_envs=1, seed=0)
     put(env, ball_x=2, ball_y=10, drift=-3, fall=4, paddle=8)
@@ -96,36 +85,9 @@ def test_left_wall_and_paddle_at_the_left():
     assert info["state"][0].tolist() == [3, 14, 3, 4, 6]
 
 
-def test_the_drawing_is_the_state():
-    actions = np.random.default_rng(0).integers(0, 3, (60, 8))
-    out = record(envs.make("Catch", num_envs=8, seed=3), actions)
-    frames = np.concatenate([x[..., 0] for x in out if x.ndim == 4]).astype(float)
-    states = np.concatenate([x for x in out if x.shape == (8, 5)])
-    assert len(frames) == len(states) > 480
-    ball, paddle = frames[:, :76], frames[:, 76:]
-    # 3 x 3 and 3 x 13 pixels of full brightness; rows 76 to 78 are the paddle's.
-    assert set(np.unique(frames)) == {0, catch.BRIGHTNESS}
-    assert (ball > 0).sum((1, 2)).tolist() == [9] * len(frames)
-    assert (paddle > 0).sum((1, 2)).tolist() == [39] * len(frames)
-    index = np.arange(84)
-    mass = ball.sum((1, 2))
-    np.testing.assert_allclose(ball.sum(1) @ index / mass, states[:, 0])
-    np.testing.assert_allclose(ball.sum(2) @ index[:76] / mass, states[:, 1])
-    np.testing.assert_allclose(paddle.sum(1) @ index / paddle.sum((1, 2)), states[:, 4])
-
-
-def test_the_small_frame_is_the_mean_of_the_large_one():
-    actions = np.random.default_rng(0).integers(0, 3, (60, 8))
-    large = record(envs.make("Catch", num_envs=8, seed=3), actions)
-    small = record(envs.make("Catch", num_envs=8, seed=3, frame_size=42), actions)
-    means = [x.reshape(8, 42, 2, 42, 2, 1).mean((2, 4)) if x.ndim == 4 else x for x in large]
-    assert same(means, small)
-
-
 @BOTH
-@pytest.mark.parametrize("seed", range(3))
-def test_a_perfect_player_catches_every_ball(game, seed):
-    returns = play(envs.make(game, num_envs=100, seed=seed), follow, episodes=1000)
+def test_a_perfect_player_catches_every_ball(game):
+    returns = play(envs.make(game, num_envs=100, seed=0), follow, episodes=1000)
     assert (returns == 1).all()
 
 
@@ -135,8 +97,7 @@ def test_every_encoder_sees_the_paddle(name, size):
     # A VALID convolution with a stride may leave out the last rows of an image. The paddle once lay there.
     env = envs.make("Catch", num_envs=1, seed=0, frame_size=size)
     encoder = encoders.REGISTRY[name]((size, size, 4))
-    params = jax.jit(encoder.init)(jax.random.key(0))
-    apply = jax.jit(encoder.apply)
+    params, apply = random_params(encoder.init), jit(encoder.apply)
     latents = []
     for paddle in (30, 40):
         put(env, ball_x=50, ball_y=20, drift=0, fall=3, paddle=paddle)
@@ -144,7 +105,7 @@ def test_every_encoder_sees_the_paddle(name, size):
     assert np.abs(latents[0] - latents[1]).max() > 1e-4
 
 
-@pytest.mark.parametrize("ball", [1, 2, 3, 4, 12])
+@pytest.mark.parametrize("ball", [1, 3, 12])
 def test_every_start_can_be_won(ball):
     # All starts at once, without the drawing: fall, steps, column, drift, paddle. The ball lands on row 75.
     before, after = (ball - 1) // 2, ball // 2
@@ -279,15 +240,18 @@ def test_the_games_with_a_name_are_what_they_were(game, size, digest):
     assert found.hexdigest()[:16] == digest
 
 
-@pytest.mark.parametrize("ball", [1, 2, 4, 12])
-def test_balls_of_other_sizes(ball):
-    # As many bright pixels as the ball has, around its state, or half a pixel more to the right and below
-    # where its size is even; and at 42 x 42 the mean of 2 x 2 pixels.
+@pytest.mark.parametrize("ball", [1, 2, 3, 12])
+def test_the_drawing_is_the_state(ball):
+    # As many pixels of full brightness as the ball has, around its state, or half a pixel more to the right
+    # and below where its size is even; 3 x 13 of the paddle, in rows 76 to 78; at 42 x 42 the mean of 2 x 2.
     actions = np.random.default_rng(0).integers(0, 3, (40, 8))
     large = record(envs.make(f"catch:ball={ball}", num_envs=8, seed=3), actions)
     frames = np.concatenate([x[..., 0] for x in large if x.ndim == 4]).astype(float)
     states = np.concatenate([x for x in large if x.shape == (8, 5)])
-    above = frames[:, :76]
+    assert set(np.unique(frames)) == {0, catch.BRIGHTNESS}
+    above, paddle = frames[:, :76], frames[:, 76:]
+    assert (paddle > 0).sum((1, 2)).tolist() == [39] * len(frames)
+    np.testing.assert_allclose(paddle.sum(1) @ np.arange(84) / paddle.sum((1, 2)), states[:, 4])
     assert (above > 0).sum((1, 2)).tolist() == [ball**2] * len(frames)
     index, mass, shift = np.arange(84), above.sum((1, 2)), (ball + 1) % 2 / 2
     np.testing.assert_allclose(above.sum(1) @ index / mass, states[:, 0] + shift)
@@ -302,9 +266,9 @@ def test_balls_of_other_sizes(ball):
 @pytest.mark.parametrize(
     ("ball", "column", "reward"),
     [(1, 44, 1), (1, 43, -1), (1, 56, 1), (1, 57, -1), (2, 43, 1), (2, 42, -1), (2, 56, 1), (2, 57, -1)]
-    + [(4, 42, 1), (4, 41, -1), (4, 57, 1), (4, 58, -1)],
+    + [(3, 43, 1), (3, 42, -1), (3, 57, 1), (3, 58, -1), (4, 42, 1), (4, 41, -1), (4, 57, 1), (4, 58, -1)],
 )
-def test_a_catch_is_one_shared_column_for_every_ball(ball, column, reward):
+def test_a_catch_is_one_shared_column(ball, column, reward):
     env = envs.make(f"catch:ball={ball}", num_envs=1, seed=0)
     put(env, ball_x=column, ball_y=75 - ball // 2 - 4, drift=0, fall=4, paddle=50)
     frames, rewards, terminated, _, _ = env.step(np.array([NOOP]))

@@ -22,6 +22,7 @@ from srl_jax.files.metrics import read_metrics
 from srl_jax.types import Latents
 from tests.helpers import make_context, make_window
 
+pytestmark = pytest.mark.usefixtures("shared_agents")
 GAME = "examples.own_environment:Dot-v0"
 SMALL = {"steps": 240, "eval_every": 120, "log_every": 40, "eval_games": 2, "eval_max_steps": 100}
 SMALL |= {"buffer_size": 400, "learn_start": 40, "num_envs": 4, "batch_size": 8, "frame_size": 42}

@@ -3,14 +3,16 @@
 import dataclasses
 import json
 from collections.abc import Sequence
-from functools import partial
+from contextlib import contextmanager
+from functools import cache, partial
 from pathlib import Path
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.agent import make_agent
+from srl_jax.agent import Agent, Seeds, make_agent, over_seeds
 from srl_jax.config import Config
 from srl_jax.files import checkpoint
 from srl_jax.run import ending
@@ -56,6 +58,47 @@ def _compiler_options() -> dict:
 
 jit = partial(jax.jit, compiler_options=_compiler_options())
 """For functions that run a few times only: compiles them several times faster."""
+
+HOST_ONLY = (
+    "game", "seed", "steps", "buffer_size", "updates_per_step", "learn_start", "gamma", "lr_final_share",
+    "beta", "beta_final", "eval_every", "eval_games", "eval_max_steps", "stop_at_return", "log_every",
+    "checkpoint_every", "keep_encoder_every", "keep_best", "keep_replay", "diagnostics", "diagnostics_kept",
+    "loggers", "encoder_from", "heads_from", "policy_from", "pretrain_epsilon",
+)  # fmt: skip
+"""Fields of Config that `make_agent` does not read: runs that differ in these alone share an agent."""
+
+
+@cache
+def _agent(config: Config, frame_shape: tuple[int, ...], num_actions: int) -> Agent:
+    with mock.patch.object(jax, "jit", jit):
+        return make_agent(config, frame_shape, num_actions)
+
+
+def agent_of(config: Config, frame_shape=(42, 42, 1), num_actions: int = NUM_ACTIONS) -> Agent:
+    """`make_agent`'s, compiled fast, and once a session for all configurations that mean the same agent."""
+    default = {name: getattr(Config(), name) for name in HOST_ONLY}
+    return _agent(dataclasses.replace(config, **default), tuple(frame_shape), num_actions)
+
+
+_seeds: dict[tuple[int, int], tuple] = {}
+
+
+def seeds_of(agent: Agent, number: int) -> Seeds:
+    """`over_seeds`', as often as `agent_of` makes the agent."""
+    key = id(agent), number
+    if key not in _seeds:  # with the agent, so that no other gets its id
+        with mock.patch.object(jax, "jit", jit):
+            _seeds[key] = agent, over_seeds(agent, number)
+    return _seeds[key][1]
+
+
+@contextmanager
+def shared_agents():
+    """Has the loop take the agents of `agent_of`."""
+    from srl_jax.run import loop
+
+    with mock.patch.multiple(loop, make_agent=agent_of, over_seeds=seeds_of):
+        yield
 
 
 def make_context(features: int = 8) -> Context:

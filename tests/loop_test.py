@@ -18,7 +18,6 @@ from gymnasium.vector.utils import batch_space
 
 from experiments.command_line import flags as config_flags
 from srl_jax import loading, training
-from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
 from srl_jax.diagnostics.pictures import PICTURES
@@ -34,6 +33,8 @@ from srl_jax.run.schedules import Schedules
 from srl_jax.types import Window
 from srl_jax.update import Hyper
 from tests.helpers import JOINT, SMALL, identical, one_run
+
+pytestmark = pytest.mark.usefixtures("shared_agents")
 
 
 def train(path, progress=False, stop=None, **values):
@@ -52,7 +53,7 @@ def whole(path):
 
 
 @pytest.fixture(scope="module")
-def joint(tmp_path_factory):
+def joint(tmp_path_factory, shared_agents):
     """One joint run that the tests below look at, and start from."""
     path = tmp_path_factory.mktemp("runs") / "joint"
     return path, train(path, **JOINT, seed=3, diagnostics=True)
@@ -469,7 +470,6 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
     objectives = ("reconstruction", "forward_pixels", "latent_l2")
     values = {**SMALL, "steps": 120, "eval_every": 60, "diagnostics": True, "augment": "all"}
     config = Config(**{**values, "mode": "joint", "objectives": objectives})
-    agent = make_agent(config, (42, 50, 3), 3)
     rows = []
     heldout._collect.cache_clear()
     with monkeypatch.context() as patched:
@@ -478,10 +478,10 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
             path.mkdir()
             asked = itertools.count(1)
             stop = lambda at=stop_at, asked=asked: next(asked) == at  # noqa: E731
-            result = loop.train(config, path, progress=False, agent=agent, stop=stop)
+            result = loop.train(config, path, progress=False, stop=stop)
             if stop_at is not None:
                 assert result.interrupted and result.env_steps == 60
-                result = loop.train(config, path, progress=False, agent=agent, resume=whole(path))
+                result = loop.train(config, path, progress=False, resume=whole(path))
             rows.append([strip_wall(row) for row in read_metrics(path / "metrics.jsonl")])
     heldout._collect.cache_clear()
     assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 120

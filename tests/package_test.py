@@ -114,25 +114,51 @@ def _command(*arguments, cwd=ROOT, env=None):
     )
 
 
+def _main(monkeypatch, *arguments):
+    monkeypatch.setattr(sys, "argv", ["srl-jax", *arguments])
+    cli.main()
+
+
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("help",)])
-def test_the_commands_are_listed_a_line_each(arguments):
-    done = _command(*arguments)
-    assert (done.returncode, done.stderr) == (0, "")
+def test_the_commands_are_listed_a_line_each(arguments, monkeypatch, capsys):
+    _main(monkeypatch, *arguments)
+    shown = capsys.readouterr()
+    assert shown.err == ""
     for name, command in cli.COMMANDS.items():
-        assert re.search(rf"^  srl-jax {name} .*  {re.escape(command.help)}$", done.stdout, re.MULTILINE)
+        assert re.search(rf"^  srl-jax {name} .*  {re.escape(command.help)}$", shown.out, re.MULTILINE)
 
 
-def test_an_unknown_command_is_answered_with_the_ones_there_are():
-    done = _command("evalute", "runs/x")
-    assert done.returncode == 2 and not done.stdout
-    assert done.stderr.startswith("error: evalute: no such command; did you mean evaluate? valid: train,")
+def test_an_unknown_command_is_answered_with_the_ones_there_are(monkeypatch, capsys):
+    with pytest.raises(SystemExit) as ended:
+        _main(monkeypatch, "evalute", "runs/x")
+    assert ended.value.code == 2
+    out, err = capsys.readouterr()
+    assert not out and err.startswith("error: evalute: no such command; did you mean evaluate? valid: train,")
 
 
-@pytest.mark.parametrize("name", cli.COMMANDS)
-def test_every_command_is_an_entry_point_that_imports_no_jax(name):
-    module = cli.COMMANDS[name].module or name
-    code = f"import sys, experiments.{module} as module; sys.exit('jax' in sys.modules or not module.cli)"
-    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, timeout=60).returncode == 0
+COMMANDS = [f"experiments.{command.module or name}" for name, command in cli.COMMANDS.items()]
+LIGHT = [
+    "import srl_jax.config, srl_jax.modes, srl_jax.specs, srl_jax.plugins",
+    "from srl_jax import config, envs; config.Config(game='my:E-v0'); assert len(envs.NAMES) == 59",
+    "import srl_jax.data; srl_jax.data.reference_policies('Pong')",
+    "import srl_jax.statistics",
+    "from experiments.drawing import plots; assert plots.available()",
+    *(
+        f"import experiments.{x.module or name}; experiments.{x.module or name}.cli"
+        for name, x in cli.COMMANDS.items()
+    ),
+    "import experiments.benchmarks.bench",
+]
+"""What is imported before jax may be, or where a command only reads: one after the other, in one process."""
+
+
+def test_what_is_checked_or_read_first_imports_nothing_that_is_slow():
+    heavy = {"jax", "flax", "gymnasium", "ale_py", "pandas", "matplotlib", "PIL"}
+    code = "import sys\n"
+    for line in LIGHT:
+        code += f"{line}\nif found := {heavy} & set(sys.modules): sys.exit({line!r} + str(found))\n"
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 def test_a_command_has_the_flags_of_its_entry_point():

@@ -5,7 +5,6 @@ import hashlib
 import json
 import shutil
 from functools import cache
-from unittest import mock
 
 import jax
 import numpy as np
@@ -13,14 +12,13 @@ import pytest
 from flax import serialization
 
 from srl_jax import envs, replay
-from srl_jax.agent import make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.run import loop, seed
 from srl_jax.run.actor import seed_for
-from tests.helpers import SMALL, all_moved, identical, jit, one_run
+from tests.helpers import SMALL, agent_of, all_moved, identical, one_run
 from tests.rundir_test import contents
 
 MODES = {
@@ -43,12 +41,6 @@ ENCODERS |= {"slow acts": [104]}
 EVERY = {"steps": 200, "log_every": 40, "eval_every": 60, "checkpoint_every": 52, "eval_games": 5}
 
 
-@cache
-def agent_of(config):
-    with mock.patch.object(jax, "jit", jit):  # compiles faster; what is compiled runs a few times only
-        return make_agent(config, (42, 42, 1), 3)
-
-
 def make_config(mode, **values):
     return Config(**SMALL | EVERY | MODES[mode] | values)
 
@@ -56,9 +48,7 @@ def make_config(mode, **values):
 def make_run(config, path, **options):
     """A run whose agent is compiled once for all runs of a mode."""
     path.mkdir(exist_ok=True)
-    no_matter = {"steps": 1, "stop_at_return": None, "checkpoint_every": 0, "keep_encoder_every": 0}
-    no_matter |= {"diagnostics": False, "diagnostics_kept": 0, "encoder_from": "", "keep_replay": False}
-    return one_run(config, path, agent=agent_of(dataclasses.replace(config, **no_matter)), **options)
+    return one_run(config, path, agent=agent_of(config), **options)
 
 
 def digests(run):

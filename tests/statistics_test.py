@@ -1,8 +1,6 @@
 """Statistics: hand-worked numbers, rliable as the independent reference, what must hold of any interval."""
 
 import json
-import subprocess
-import sys
 import warnings
 from fractions import Fraction
 from functools import partial
@@ -446,8 +444,3 @@ def test_the_number_of_runs_in_words():
     assert runs_text({"Pong": [1]}) == "1 run"
     assert runs_text(np.zeros((5, 2))) == "5 runs of each of 2 games"
     assert runs_text({"Pong": [1, 2], "Qbert": [1]}) == "Pong 2 runs, Qbert 1 run"
-
-
-def test_statistics_import_no_jax():
-    code = "import sys, srl_jax.statistics; sys.exit(bool({'jax', 'gymnasium', 'pandas'} & set(sys.modules)))"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)

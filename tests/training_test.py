@@ -14,6 +14,8 @@ from srl_jax.training import check_sources, resolved
 from tests.checkpoint_test import CONFIG, write
 from tests.helpers import SMALL
 
+pytestmark = pytest.mark.usefixtures("shared_agents")
+
 
 def test_a_run_is_trained_into_a_new_directory_and_loaded(tmp_path):
     path = tmp_path / "runs" / "x"
