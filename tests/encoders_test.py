@@ -284,7 +284,8 @@ def test_zeros_all_around_are_flaxs_same():
         assert padding_between(before, after, layer, centred=True) == expected
 
 
-@pytest.mark.parametrize("name", sorted(encoders.REGISTRY.keys() - {"sac_ae", "a_lix"}))  # leave out 1 row in 64
+# The other two leave out 1 row in 64.
+@pytest.mark.parametrize("name", sorted(encoders.REGISTRY.keys() - {"sac_ae", "a_lix"}))
 def test_every_pixel_of_an_odd_image_counts(name):
     shape = (64, 41, 3)
     encoder = encoders.REGISTRY[name](shape)
