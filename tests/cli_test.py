@@ -162,7 +162,7 @@ BAD = [
     (["--seeds=0,1", "--seed=2"], "--seeds=0,1", "--seed=2; give one of them"),
     (["--tune_runtime=x"], "--tune_runtime=x", "valid: auto, off"),
     (["--steps"], "--steps", ""),
-    (["--gane=Pong"], "--gane", "did you mean --game"),
+    (["--gane=Pong"], "--gane", "did you mean --gate or --game"),
     (["--lr=1"], "--lr: no such flag", "did you mean --lr_encoder or --lr_encoder_srl or"),
     (["Pong"], "'Pong'", "--name=value"),
     (["--nokeep_best=1"], "--nokeep_best=1", "argument"),

@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[1]
 HOLD = """
 import sys, time
 from pathlib import Path
-from srl_jax import rundir
+from srl_jax.files import rundir
 
 with rundir.held(Path(sys.argv[1])):
     print("held", flush=True)

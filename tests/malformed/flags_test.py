@@ -105,7 +105,7 @@ SPECS = {
         "inverse:hidden=2147483647", "inverse:hidden=" + "9" * 400, "latent_l2:hidden=4", " ",
     ),
     "encoder": (
-        "", ":", "tiny:", "Tiny", "nature:features=1", "nature:observation_shape=1", "sac_ae:features=0",
+        "", ":", "tiny:", "Tiny", "nature:channels=1", "nature:observation_shape=1", "sac_ae:end=x",
         "sac_ae:features=-1", "sac_ae:features=2.5", "sac_ae:features=1e400", "sac_ae:features=99999999999",
         "sac_ae:features=2147483647", "sac_ae:layer_norm=maybe", "sac_ae:features=256,features=256",
         f"tiny:features={CODE}", "tiny:__dict__=1", "__builtins__",
