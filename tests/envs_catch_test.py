@@ -94,8 +94,8 @@ def test_a_perfect_player_catches_every_ball(game):
 @pytest.mark.parametrize("size", [42, 84])
 @pytest.mark.parametrize("name", encoders.REGISTRY)
 def test_every_encoder_sees_the_paddle(name, size):
-    # A VALID convolution with a stride may leave out the last rows of an image. The paddle once lay there. For
-    # the published network of DER, which leaves out 9 rows of 84, it lies there still (docs/deviations.md).
+    # A VALID convolution with a stride may leave out the last rows of an image. The paddle once lay there. In
+    # the published network of DER, which leaves out 9 rows of 84, it still does (docs/deviations.md).
     if (name, size) == ("der", 84):
         return
     env = envs.make("Catch", num_envs=1, seed=0, frame_size=size)
