@@ -21,7 +21,7 @@ from tests.helpers import write_checkpoint
 from tests.soak.conftest import different, remains, rows_of
 
 SMALL = {
-    "frame_size": 42, "num_envs": 4, "buffer_size": 400, "batch_size": 8, "learn_start": 56,
+    "frame_size": 42, "num_envs": 4, "buffer_size": 400, "batch_size": 4, "learn_start": 56,
     "updates_per_step": 0.25, "steps": 96, "log_every": 24, "eval_every": 48, "eval_games": 1,
     "eval_max_steps": 20, "slow_update_every": 3, "keep_replay": True,
 }  # fmt: skip
@@ -38,6 +38,7 @@ WEIGHTS = ("0.5", "0", "1->0.01@80", "ratio:0.1", "ratio:0.1->0.01@80")
 ALWAYS = {"hidden": 16, "atoms": 11, "outputs": 16, "quantiles": 8, "target_quantiles": 6}
 ALWAYS |= {"act_quantiles": 4, "cosines": 8, "v_min": -2.0, "v_max": 2.0}
 """Options that keep networks small, wherever a row has them. Rainbow without a distribution refuses some."""
+UNREAD = ("atoms", "v_min", "v_max", "init_std", "priority")
 
 OPTIONS = {
     # RL
@@ -71,6 +72,12 @@ SETTINGS = {
     "keep_encoder_every": (1,),
 }  # fmt: skip
 """{field of Config: what is drawn, one time in ten}."""
+
+NEEDED = {
+    "shared_hidden": {"dueling": True}, "munchausen": {"double": False}, "target=s_t+n-1": {"n_step": 2},
+    "copies=2": {"view": "shift"}, "target_copies=2": {"view": "shift"}, "init_std": {"init_std": 1.0},
+}  # fmt: skip
+"""{an option, or one of its values: what it needs beside it}; refused without."""
 
 
 class Draw(NamedTuple):
@@ -114,8 +121,12 @@ def draw_spec(rng: random.Random, registry: str, row: str, factory, share: float
             given[option] = ALWAYS[option]
         elif values and rng.random() < share:
             given[option] = rng.choice(values)
-    if given.get("distributional") is False:
-        given = {name: x for name, x in given.items() if name not in ("atoms", "v_min", "v_max")}
+    for what, needed in NEEDED.items():
+        option, equals, value = what.partition("=")
+        if option in given and str(given[option]) == (value or str(given[option])) and rng.random() < 0.8:
+            given |= needed
+    if given.get("distributional") is False and rng.random() < 0.9:
+        given = {name: x for name, x in given.items() if name not in UNREAD}
     return specs.join(row, given)
 
 
@@ -176,9 +187,11 @@ def config_of(drawn: Draw, folder: Path) -> Config:
 
 
 def sentence(error: ConfigError) -> str:
-    """An error less what was drawn: values of flags and options become dots, so that like ones are counted."""
-    text = re.sub(r"^--(\w+)=.*?: ", r"--\1=…: ", str(error))
-    return re.sub(r"(--\w+=)[^\s;,]+", r"\1…", text)
+    """An error less what was drawn: specifications, paths and numbers are left out, so that like ones count
+    as one.
+    """
+    text = re.sub(r"=\S*[:/]\S*(?=[:;,] )", "=…", str(error))
+    return re.sub(r"=\d[\d.e@>-]*", "=N", text)
 
 
 def stop_at(calls: int):
