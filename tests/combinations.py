@@ -130,8 +130,13 @@ def draw_spec(rng: random.Random, registry: str, row: str, factory, share: float
     return specs.join(row, given)
 
 
-def draw(number: int) -> Draw:
-    """The number-th run: a mode, rows of all registries with options, and settings."""
+def draw(number: int, encoder: str = "") -> Draw:
+    """The number-th run: a mode, rows of all registries with options, and settings.
+
+    Args:
+        number: names the draw, which is the same every time.
+        encoder: a row, in place of a drawn one.
+    """
     rng = random.Random(f"combination {number}")
     mode = modes.MODES[rng.choice([*modes.MODES, "joint", "joint", "decoupled"])]
     values = {"mode": mode.name, "game": rng.choice(GAMES), "seed": rng.randrange(100)}
@@ -154,7 +159,7 @@ def draw(number: int) -> Draw:
     if rng.random() < 0.15:
         n = specs.parse(values["rl"], rl.REGISTRY).resolved["n_step"]
         values["n_anneal"] = f"{n}->1@4"
-    row = rng.choice([*encoders.REGISTRY, "tiny", "der"])
+    row = encoder or rng.choice([*encoders.REGISTRY, "tiny", "der"])
     values["encoder"] = draw_spec(rng, "encoder", row, encoders.REGISTRY[row], 0.2)
     if mode.representation or rng.random() < 0.05:
         names = rng.sample([*objectives.REGISTRY], rng.choice((1, 1, 2, 3)))
