@@ -27,4 +27,4 @@ def forgotten():
 def test_a_random_combination_runs_and_resumes_or_is_refused(tmp_path, number, record_property):
     refused = combinations.run(combinations.draw(number), tmp_path)
     record_property("draws", 1)
-    record_property(f"refused with: {refused}" if refused else "run, with a resume that is bit-identical", 1)
+    record_property(f'refused with "{refused}"' if refused else "run, with a resume that is bit-identical", 1)
