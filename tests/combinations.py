@@ -130,6 +130,12 @@ def draw_spec(rng: random.Random, registry: str, row: str, factory, share: float
     return specs.join(row, given)
 
 
+def with_ratio(text: str) -> str:
+    """An objective with a ratio for a weight."""
+    name, options = specs.split(text)
+    return specs.join(name, options | {"weight": "ratio:0.1"})
+
+
 def draw(number: int, encoder: str = "") -> Draw:
     """The number-th run: a mode, rows of all registries with options, and settings.
 
@@ -166,6 +172,9 @@ def draw(number: int, encoder: str = "") -> Draw:
         values["objectives"] = tuple(
             draw_spec(rng, "objective", name, objectives.REGISTRY[name], 0.25) for name in names
         )
+        if mode.name == "joint" and random.Random(f"ratios {number}").random() < 0.2:
+            # With two Adams a ratio needs all the others, which chance alone rarely gives.
+            values["objectives"] = tuple(with_ratio(text) for text in values["objectives"])
         ratios = [specs.has_ratio(text) for text in values["objectives"]]
         meet = mode.name == "joint" and (values.get("encoder_optimizer") == "summed" or all(ratios))
         if any(ratios) and not meet and rng.random() < 0.8:
