@@ -61,7 +61,7 @@ docs: install ## write the API reference, build/docs/index.html
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .
 
-soak: install ## try to break what is promised about killed runs, disks and inputs (two hours)
+soak: install ## try to break what is promised about killed runs, disks, inputs and combinations (2.5 hours)
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[soak]'
 	@$(VENV)/bin/python -m pytest $(if $(findstring tests/soak,$(ARGS)),,tests/soak) $(ARGS)
 

@@ -174,15 +174,15 @@ def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", comp
             raise ConfigError(f"--{flag}={view}: --mode={mode.name} has no loss that sees it; leave it out")
     _check_gate(config, mode)
     _check_ratios(config)
+    moves = mode.rl_trains_encoder or mode.representation_trains_encoder
+    for flag in ("lr_encoder", "lr_encoder_srl"):
+        if (rate := getattr(config, flag)) and not moves:
+            raise ConfigError(f"--{flag}={rate}: --mode={mode.name} never moves the encoder; give 0")
     if config.lr_encoder_srl and not two_optimizers(config):
         raise ConfigError(
-            f"--lr_encoder_srl={config.lr_encoder_srl}: with --mode={mode.name} and "
+            f"--lr_encoder_srl={config.lr_encoder_srl}: with --mode={mode.name}, --gate={config.gate} and "
             f"--encoder_optimizer={config.encoder_optimizer} the encoder has one optimizer, whose rate is "
             "--lr_encoder; give 0"
-        )
-    if config.lr_encoder and mode.encoder_start == "checkpoint" and not mode.rl_trains_encoder:
-        raise ConfigError(
-            f"--lr_encoder={config.lr_encoder}: --mode={mode.name} never moves the encoder; give 0"
         )
 
 

@@ -190,3 +190,17 @@ def test_a_projection_is_refused_where_the_second_gradient_comes_later(gate):
         ConfigError, match=f"^--gate={gate}: .*=separate .* give --encoder_optimizer=summed or"
     ):
         modes.check(config)
+
+
+@pytest.mark.parametrize(
+    ("mode", "gate"), [(m, "sum") for m in MODES] + [("joint", "rl_stopped"), ("joint", "srl_stopped")]
+)
+def test_a_second_rate_is_refused_with_what_leaves_the_encoder_one_optimizer_or_none(mode, gate):
+    start = {"encoder_from": "x"} if mode in ("frozen", "finetuned") else {}
+    config = small(mode, gate=gate, lr_encoder_srl=0.1, **start)
+    if (mode, gate) == ("joint", "sum"):
+        return modes.check(config)
+    of = f"with --mode={mode}, --gate={gate} and --encoder_optimizer=separate the encoder has one optimizer"
+    reason = "--mode=frozen never moves the encoder" if mode == "frozen" else of
+    with pytest.raises(ConfigError, match=f"^--lr_encoder_srl=0.1: {reason}.* give 0$"):
+        modes.check(config)

@@ -92,6 +92,12 @@ def seeds_of(agent: Agent, number: int) -> Seeds:
     return _seeds[key][1]
 
 
+def forget_agents() -> None:
+    """Has those of `agent_of` and `seeds_of` made anew."""
+    _agent.cache_clear()
+    _seeds.clear()
+
+
 @contextmanager
 def shared_agents():
     """Has the loop take the agents of `agent_of`."""
@@ -249,7 +255,13 @@ def write_run(
 
 
 def write_checkpoint(
-    run: Path, *, env_steps: int = 240, folder: str = "checkpoints", only: Sequence[str] = (), **values
+    run: Path,
+    *,
+    env_steps: int = 240,
+    folder: str = "checkpoints",
+    only: Sequence[str] = (),
+    channels: int = 1,
+    **values,
 ) -> Path:
     """A checkpoint of random parameters of an agent on Catch, less the run around it.
 
@@ -258,10 +270,11 @@ def write_checkpoint(
         env_steps: when it was written; also the seed of the parameters.
         folder: of the run, where it goes.
         only: groups of parameters that are kept; empty for all.
+        channels: of its frames.
         **values: fields of its Config, in place of `SMALL`'s.
     """
     config = Config(**{**SMALL, **values})
-    frame = (config.frame_size, config.frame_size, 1)
+    frame = (config.frame_size, config.frame_size, channels)
     params = fill(make_agent(config, frame, NUM_ACTIONS).shapes().params, env_steps)
     kept = {name: params[name] for name in only or params}
     counts = {"num_actions": NUM_ACTIONS, "env_steps": env_steps, "updates": 1}

@@ -16,9 +16,10 @@ from absl import flags
 
 from experiments import train
 from experiments.command_line import flags as config_flags
-from srl_jax.config import Config, git_revision
+from srl_jax.config import Config
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.files.provenance import git_revision
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -32,6 +33,7 @@ AMOUNTS = {
     "memory_steps": (60_000, "env steps in which memory may not grow"),
     "buffer": (100_000, "transitions in the buffer whose checkpoints are timed"),
     "sweep_kills": (20, "SIGKILLs to a sweep below a figure"),
+    "combinations": (300, "random runs from the registries"),
     "worker_kills": (5, "SIGKILLs to workers of a Ray cluster"),
 }
 """{option: (the campaign's, help)}."""
