@@ -235,8 +235,9 @@ OBJECTIVES = (
 def _objective(name: str) -> Group:
     """What an objective adds to an update of RL alone, at the size of Catch, one Adam on the sum."""
     beside = _ours(SMALL, 60, mode="joint", objectives=(name,), encoder_optimizer="summed")
-    row = _cost(f"RL and {name} / RL", name, "alone", "RL alone")
-    return Group({"alone": _ours(SMALL, 60), name: beside}, {f"objective_{name}": row})
+    alone = f"alone beside {name}"  # a name of its own: both take turns
+    row = _cost(f"RL and {name} / RL", name, alone, "RL alone")
+    return Group({alone: _ours(SMALL, 60), name: beside}, {f"objective_{name}": row})
 
 
 OF_OBJECTIVES = tuple(_objective(name) for name in OBJECTIVES)
