@@ -4,7 +4,7 @@ import math
 from typing import TYPE_CHECKING, NamedTuple
 
 from srl_jax.errors import ConfigError
-from srl_jax.specs import Spec, parse_value, value_text
+from srl_jax.specs import Spec, parse_change, value_text
 
 if TYPE_CHECKING:
     from srl_jax.config import Config
@@ -51,11 +51,9 @@ def parse(text: str, kind: type) -> Anneal:
     Raises:
         ValueError: it is not such a text; a reason to follow the value.
     """
-    first, _, rest = text.partition("->")
-    last, _, updates = rest.partition("@")
     example = "'10->3@10000'" if kind is int else "'0.97->0.997@10000'"
     try:
-        found = Anneal(parse_value(first, kind), parse_value(last, kind), parse_value(updates, int))  # type: ignore[arg-type]
+        found = Anneal(*parse_change(text, kind))
     except ValueError:
         raise ValueError(f"not start->end@updates, in quotes for the shell: {example}") from None
     for number in found[:2]:

@@ -11,9 +11,9 @@ from typing import Any
 
 import jax
 
+from srl_jax.latents import named_key
 from srl_jax.optim import ENCODER, ENCODER_SRL, RL
 from srl_jax.types import Array, Params, TrainState
-from srl_jax.update import named_key
 
 TRANSITION = "transition"
 """The name of what is shrunk in an objective's head, as SPR's model of the next latent."""

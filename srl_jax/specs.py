@@ -154,6 +154,17 @@ class Weight(float):
     __hash__ = float.__hash__
 
 
+def parse_change(text: str, kind: type) -> tuple[Any, Any, int]:
+    """The two numbers and the count of `start->end@count`.
+
+    Raises:
+        ValueError: it is not such a text.
+    """
+    start, _, rest = text.partition("->")
+    end, _, count = rest.partition("@")
+    return parse_value(start, kind), parse_value(end, kind), parse_value(count, int)  # type: ignore[return-value]
+
+
 def parse_weight(text: str) -> float:
     """Reads a weight: `0.5`, `1->0.01@200000` (over env steps), `ratio:0.1` or `ratio:0.1->0.01@200000`.
 
@@ -161,22 +172,24 @@ def parse_weight(text: str) -> float:
         ValueError: it is none of these. The message is a reason to follow the value.
     """
     kind, colon, numbers = text.strip().rpartition(":")
-    first, arrow, rest = numbers.partition("->")
-    if not (colon or arrow):
+    changes = "->" in numbers
+    if not (colon or changes):
         return parse_value(text, float)  # type: ignore[return-value]
-    last, at, steps = rest.partition("@")
     wrong = ValueError("not a weight: a number, 1->0.01@200000 (until that env step), or ratio: before these")
-    if kind != ("ratio" if colon else "") or bool(arrow) != bool(at):
+    if kind != ("ratio" if colon else ""):
         raise wrong
     try:
-        start = parse_value(first, float)
-        final, until = (parse_value(last, float), parse_value(steps, int)) if arrow else (start, 0)
+        if changes:
+            start, final, until = parse_change(numbers, float)
+        else:
+            start, until = parse_value(numbers, float), 0
+            final = start
         for number in (start, final):
             Info(float, "", minimum=0).check(number)
-        Info(int, "", minimum=1 if arrow else 0).check(until)
+        Info(int, "", minimum=1 if changes else 0).check(until)
     except ValueError:
         raise wrong from None
-    return Weight(start, final, until, bool(colon))  # type: ignore[arg-type]
+    return Weight(start, final, until, bool(colon))
 
 
 def has_ratio(text: str) -> bool:

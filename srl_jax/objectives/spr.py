@@ -1,5 +1,7 @@
 """Self-predictive representations: SPR (Schwarzer et al. 2021)."""
 
+import math
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -70,7 +72,7 @@ def spr(
     check_choice("target", target, TARGETS)
     features = context.features
     shape = context.map_shape or ()
-    if int(jnp.prod(jnp.array(shape))) != features or len(shape) != 3:
+    if math.prod(shape) != features or len(shape) != 3:
         shape = (1, 1, features)
     init_transition, transition = functions(Transition(tuple(shape)), features, context.num_actions)
     init_project, project = functions(Dense(hidden), features)

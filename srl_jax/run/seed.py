@@ -16,6 +16,7 @@ from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
+from srl_jax.latents import named_key
 from srl_jax.loading import greedy_policy
 from srl_jax.optim import real_copy
 from srl_jax.replay import Replay, fitting
@@ -24,7 +25,6 @@ from srl_jax.run.evaluate import Evaluation, evaluate
 from srl_jax.run.reporting import Report
 from srl_jax.run.schedules import Now
 from srl_jax.types import Params, TrainState
-from srl_jax.update import named_key
 
 RECORDED = 501
 """Frames of the last evaluation that are kept: of 500 env steps."""
