@@ -57,6 +57,7 @@ from srl_jax.statistics.intervals import (
     bootstrap_difference,
     percentile_interval,
 )
+from srl_jax.statistics.power import MOST, runs_needed, smallest_effect, welch_power
 from srl_jax.statistics.student import mean_difference, mean_interval, t_probability, t_quantile, welch_p
 from srl_jax.statistics.table import runs_text, summary
 
@@ -64,6 +65,7 @@ __all__ = [
     "AGGREGATES",
     "BOOTSTRAP",
     "ENOUGH",
+    "MOST",
     "NARROW",
     "NONE",
     "STUDENT",
@@ -89,10 +91,13 @@ __all__ = [
     "performance_profile",
     "probability_of_improvement",
     "reached",
+    "runs_needed",
     "runs_text",
+    "smallest_effect",
     "steps_to",
     "summary",
     "t_probability",
     "t_quantile",
     "welch_p",
+    "welch_power",
 ]
