@@ -149,11 +149,12 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_string(
         "from", "", f"where spreads come from: a directory of runs, or {PUBLISHED}", flag_values=values
     )
-    flags.DEFINE_string(
-        "game", None, "the game that counts; by default all of --from", flag_values=values
-    )
-    flags.DEFINE_list(
-        "arms", [], "two arms, or methods, of --from; by default each beside one like it", flag_values=values
+    flags.DEFINE_string("game", None, "the game that counts; by default all of --from", flag_values=values)
+    flags.DEFINE_multi_string(
+        "arm",
+        [],
+        "of --from, given twice: the two that differ; by default each beside one like it",
+        flag_values=values,
     )
 
 
@@ -164,16 +165,16 @@ def report(values: flags.FlagValues) -> list[str]:
         ConfigError: it is not valid, or there is no spread.
     """
     effect, seeds, power = (values[name].value for name in ("effect", "seeds", "power"))
-    source, given, arms = values["from"].value, values["spread"].value, values["arms"].value
+    source, given, arms = values["from"].value, values["spread"].value, values["arm"].value
     if bool(source) == bool(given):
         raise ConfigError("--spread or --from: give one of them, --spread=0.12 or --from=DIRECTORY")
     if given:
         own = [_positive(text, given) for text in given]
         if len(own) > 2 or arms or values["game"].value:
-            raise ConfigError(f"--spread={','.join(given)}: one or two numbers, without --game and --arms")
+            raise ConfigError(f"--spread={','.join(given)}: one or two numbers, without --game and --arm")
         return table("", [("", 0, (own[0], own[-1]))], effect, seeds, power)
     if len(arms) not in (0, 2):
-        raise ConfigError(f"--arms={','.join(arms)}: name two, or none")
+        raise ConfigError(f"--arm={arms[0]}: give it twice, for the two arms, or not at all")
     game = envs.canonical(values["game"].value) if values["game"].value else None
     if source != PUBLISHED:
         found = of_runs(Path(os.path.expanduser(source)), game)
@@ -190,7 +191,7 @@ def report(values: flags.FlagValues) -> list[str]:
             named = {x.name: x for x in spreads}
             for arm in arms:
                 if arm not in named:
-                    raise ConfigError(f"--arms={arm}: {game}: {choices_text(arm, named)}")
+                    raise ConfigError(f"--arm={arm}: {game}: {choices_text(arm, named)}")
             two = [named[arm] for arm in arms]
             deviations = (two[0].deviation, two[1].deviation)
             rows = [(" and ".join(arms), min(x.runs for x in two), deviations)]

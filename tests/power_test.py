@@ -1,8 +1,5 @@
 """Tests of srl_jax.statistics.power, and of experiments.power."""
 
-import csv
-from pathlib import Path
-
 import numpy as np
 import pytest
 from absl import flags
@@ -10,6 +7,7 @@ from scipy import stats
 
 from experiments import power
 from experiments.command_line import flags as config_flags
+from srl_jax import data
 from srl_jax.errors import ConfigError
 from srl_jax.statistics import MOST, runs_needed, smallest_effect, welch_p, welch_power
 from tests.helpers import write_run
@@ -90,17 +88,19 @@ def test_the_spread_of_runs_is_that_of_their_area(tmp_path):
     assert [row[:3] for row in rows[:2]] == [["a", "3", "1"], ["b", "3", "3"]]
     assert rows[2][:4] == ["all", "arms", "6", f"{5**0.5:.3g}"] and len(rows) == 3
     assert rows[0][-1] == str(runs_needed(2, (1, 1)))
-    (_, row) = _lines(f"--from={tmp_path}", "--effect=2", "--arms=b,a", "--game=Catch")
+    (_, row) = _lines(f"--from={tmp_path}", "--effect=2", "--arm=b", "--arm=a", "--game=Catch")
     assert row[:7] == ["b", "and", "a", "3", "3", "and", "1"]
     assert row[-1] == str(runs_needed(2, (3, 1)))
 
 
-def test_published_spreads_are_those_of_the_table():
-    with (Path(power.__file__).parents[1] / "srl_jax/data/published.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["game"] == "Pong" and row["spread"]]
+def test_published_spreads_are_those_of_the_tables():
+    found = power.of_published("Boxing")
+    der = next(x for x in found if x.name == "DER, 100 runs")
+    assert (der.runs, der.deviation) == (100, data.atari100k("DER, 100 runs")["Boxing"].sd)
     found = power.of_published("Pong")
-    assert [x.deviation for x in found] == [float(row["spread"]) for row in rows]
-    assert len({x.name for x in found}) == len(rows) and found[0].runs == int(rows[0]["seeds"])
+    assert len({x.name for x in found}) == len(found) and all(x.deviation > 0 for x in found)
+    long = next(x for x in found if x.name == "Dopamine Rainbow, 10,000,000 env steps")
+    assert (long.runs, long.deviation) == (5, 0.55)
 
 
 @pytest.mark.parametrize(
@@ -112,8 +112,8 @@ def test_published_spreads_are_those_of_the_table():
         (["--spread=1,2,3"], "one or two numbers"),
         (["--from=published"], "needs a game"),
         (["--from=published", "--game=Catch"], "--game=Catch: .* needs a game with published spreads"),
-        (["--from=published", "--game=Pong", "--arms=x"], "name two"),
-        (["--from=published", "--game=Pong", "--arms=x,y"], "--arms=x: Pong: "),
+        (["--from=published", "--game=Pong", "--arm=x"], "--arm=x: give it twice"),
+        (["--from=published", "--game=Pong", "--arm=x", "--arm=y"], "--arm=x: Pong: "),
     ],
 )
 def test_what_the_command_line_refuses(arguments, message):
