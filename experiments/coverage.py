@@ -14,12 +14,11 @@ import numpy as np
 from absl import flags
 
 from srl_jax import data, statistics
-from srl_jax.errors import SaveError
 from srl_jax.files import display
-from srl_jax.files.reading import replace_text
 from srl_jax.specs import Info
 
 from .command_line import flags as config_flags
+from .reporting import texts
 from .runs import populations
 
 FLAGS = flags.FLAGS
@@ -239,11 +238,7 @@ def main(argv: list[str]) -> None:
             "runs": RUNS,
             "covered": found,
         }
-        try:
-            out.mkdir(parents=True, exist_ok=True)
-            replace_text(out / "coverage.json", json.dumps(content, indent=1) + "\n")
-        except OSError as error:
-            raise SaveError(f"--out={FLAGS.out}: {error.strerror or error}") from error
+        texts.write(out, {"coverage.json": json.dumps(content, indent=1)})
 
 
 if __name__ == "__main__":
