@@ -265,7 +265,7 @@ def draw(found: Mapping[str, Any], path: Path) -> Path:
     """Draws false claims, and what fresh runs say of claims."""
     figure = plots.new_figure(9.2, 3.4)
     axes = figure.subplots(1, 2, sharey=True)
-    looks = dict(zip(map(str, SEEDS), (("#d55e00", -0.16), ("#0072b2", 0.16)), strict=True))
+    looks = dict(zip(map(str, SEEDS), (("#d55e00", -0.16), ("#0072b2", 0.16)), strict=False))
     for seeds, (colour, shift) in looks.items():
         for i, rule in enumerate(RULES):
             row, at = found["nothing"][seeds][rule], i + shift
