@@ -72,11 +72,17 @@ def chosen(results: Path = RESULTS) -> list[ChosenArm]:
     return found
 
 
-def areas(arm: ChosenArm, start: int = 0) -> np.ndarray:
-    """The area under each run's learning curve from an env step on at which all were evaluated, [runs]."""
+def areas(arm: ChosenArm, start: int = 0, until: int | None = None) -> np.ndarray:
+    """The area under each run's learning curve, float64 [runs], between evaluations that all of them have.
+
+    Args:
+        arm: whose runs.
+        start: env step of the first evaluation, or before it.
+        until: env step of the last one, or after it; None for the end.
+    """
     steps, returns = statistics.at_equal_steps([collect.steps_and_returns(run) for run in arm.runs])
-    later = steps >= start
-    return statistics.area_under_curve(steps[later], returns[:, later])
+    kept = (steps >= start) & (steps <= (steps[-1] if until is None else until))
+    return statistics.area_under_curve(steps[kept], returns[:, kept])
 
 
 def residuals(groups: Sequence[np.ndarray]) -> np.ndarray:
