@@ -123,7 +123,7 @@ def test_values_and_strata(arms):
 def test_what_predicts_is_found_and_drawn(arms, few, monkeypatch, tmp_path):
     pytest.importorskip("matplotlib")
     monkeypatch.setattr(predictors, "KEYS", (KEY, "diag/drift/cka", "diag/error/*/static"))
-    monkeypatch.setattr(predictors, "LEVEL", 0.5)  # of 120 orders of five seeds, two are as good
+    monkeypatch.setattr(predictors, "LEVEL", 0.5)  # of few orders some are as good by chance
     rows = predictors.analyse(arms)
     assert json.dumps(rows) == json.dumps(predictors.analyse(arms)) and len(rows) == 2 * 2 * 2 * 4
     its = {key: [row for row in rows if row["key"] == key] for key in (*predictors.KEYS, predictors.SO_FAR)}
@@ -132,7 +132,7 @@ def test_what_predicts_is_found_and_drawn(arms, few, monkeypatch, tmp_path):
     assert all(row["correlation"][0] is None and row["p"] is None for row in its["diag/error/*/static"])
     assert all(row["holm"] is None for row in its[predictors.SO_FAR])
     text = predictors.tables(rows)
-    assert text.startswith("16 tests") and text.count("| yes") == 4 and text.count("| no |") >= 4
+    assert text.startswith("16 tests") and text.count("| yes") == 8 and text.count("| no |") == 4
     assert predictors.draw(rows, tmp_path / "x.png").stat().st_size > 5_000
 
 
