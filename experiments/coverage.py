@@ -28,7 +28,7 @@ GAMES = 5
 """Of a formula's aggregate."""
 REPETITIONS = 1_000
 """Of a bootstrap."""
-SEVERAL = 5
+SEVERAL = 10
 """How many times fewer experiments there are of several games."""
 TAILS = (0.025, 0.975)
 _BLOCK = 1 << 21
@@ -100,7 +100,36 @@ def interquartile_mean(scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return values[..., cut : total - cut].mean(-1), variance / (1 - 2 * cut / total) ** 2
 
 
+def mean_again(rng: np.random.Generator, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What `mean` gives of runs drawn again within each game, in a product of matrices.
+
+    Args:
+        rng: of the draws, which are alike in all experiments.
+        scores: float64 [experiments, runs, games].
+
+    Returns:
+        float64 [experiments, repetitions] and [experiments, repetitions, games].
+    """
+    runs, games = scores.shape[-2:]
+    counts = rng.multinomial(runs, np.full(runs, 1 / runs), (games, REPETITIONS)).swapaxes(1, 2)
+    own = scores.mean(-2, keepdims=True)
+    rest = np.moveaxis(scores - own, -1, 0)
+    means = rest @ counts / runs
+    variances = np.maximum(rest**2 @ counts / runs - means**2, 0) * (runs / (runs - 1))
+    variances *= counts.max(1)[:, None] < runs  # a run alone has no spread, whatever was rounded
+    points = own.mean(-1) + means.mean(0)
+    return points, np.moveaxis(variances, 0, -1) / (runs * games**2)
+
+
+def interquartile_mean_again(rng: np.random.Generator, scores: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Likewise of `interquartile_mean`."""
+    _, runs, games = scores.shape
+    draws = rng.integers(runs, size=(REPETITIONS, runs, games))
+    return interquartile_mean(scores.astype(np.float32)[:, draws, np.arange(games)])
+
+
 Statistic = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+AGAIN = {mean: mean_again, interquartile_mean: interquartile_mean_again}
 
 
 def covered(
@@ -128,7 +157,7 @@ def covered(
     size = max(1, _BLOCK // (REPETITIONS * runs * games))
     for start in range(0, experiments, size):
         block = slice(start, start + size)
-        again = [statistic(_again(rng, arm[block])) for arm in arms]
+        again = [AGAIN[statistic](rng, arm[block]) for arm in arms]
         points, spreads = _less(again)
         limits.setdefault("bootstrap", []).append(_quantiles(points))
         if runs == 2 and games == 1:
@@ -143,13 +172,6 @@ def covered(
         low, high = np.concatenate(blocks, axis=1)
         found[kind] = float(np.mean((low <= truth) & (truth <= high)))
     return found
-
-
-def _again(rng: np.random.Generator, scores: np.ndarray) -> np.ndarray:
-    """Runs drawn again within each game, float32 [experiments, repetitions, runs, games]; alike in each."""
-    _, runs, games = scores.shape
-    draws = rng.integers(runs, size=(REPETITIONS, runs, games))
-    return scores.astype(np.float32)[:, draws, np.arange(games)]
 
 
 def _quantiles(values: np.ndarray) -> np.ndarray:
@@ -178,7 +200,7 @@ def table(
     """What intervals cover: source -> "mean, t" and so on -> a share for each of `RUNS`, None where none is.
 
     Args:
-        experiments: that are simulated of one game; of several games a fifth of them.
+        experiments: that are simulated of one game; of several games a tenth of them.
         given: where returns come from.
         seed: of all draws.
     """

@@ -58,6 +58,18 @@ def test_aggregates_are_the_librarys_and_know_how_much_they_vary():
     assert (coverage.mean(np.full((1, 3, 1), 0.1, np.float32))[1] == 0).all()
 
 
+def test_means_of_runs_drawn_again_are_those_of_the_draws(monkeypatch):
+    """Of two runs, 0 and 1 in one game and 4 and 8 in the other: a draw has both, or one twice."""
+    monkeypatch.setattr(coverage, "REPETITIONS", 400)
+    points, variances = coverage.mean_again(np.random.default_rng(0), np.array([[[0.0, 4.0], [1.0, 8.0]]]))
+    pairs = {(round(float(p), 9), *np.round(v, 9)) for p, v in zip(points[0], variances[0], strict=True)}
+    own = {(a, v, b, w) for a, v in ((0, 0), (0.5, 1 / 16), (1, 0)) for b, w in ((4, 0), (6, 1), (8, 0))}
+    assert pairs == {((a + b) / 2, v, w) for a, v, b, w in own}
+    rng = np.random.default_rng(0)
+    points, _ = coverage.interquartile_mean_again(rng, np.array([[[0.0, 4.0], [1.0, 8.0]]]))
+    assert {round(float(p), 6) for p in points[0]} == {2, 2.5, 4, 4.5}  # the two in the middle of four
+
+
 def test_the_table_has_a_column_for_each_number_of_runs(monkeypatch):
     monkeypatch.setattr(coverage, "RUNS", (2, 3))
     given = [coverage.Returns("a", [populations.normal()]), coverage.Returns("b", (), [np.arange(9.0)] * 2)]
