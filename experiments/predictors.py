@@ -15,6 +15,7 @@ from absl import flags
 
 from srl_jax.errors import ConfigError
 from srl_jax.files import display
+from srl_jax.statistics import ENOUGH
 
 from .command_line import flags as config_flags
 from .drawing import plots
@@ -207,16 +208,27 @@ def analyse(arms: Sequence[ChosenArm]) -> list[dict[str, Any]]:
 def _row(strata: Sequence[Stratum], level: str, key: str) -> dict[str, Any]:
     arms = len(strata) if level == LEVELS[0] else sum(len(one.x) for one in strata)
     sums = np.sum([moments(*one[:3]) for one in strata], axis=0)
-    row: dict[str, Any] = {"arms": arms}
+    vary = _varying(strata, level)
+    row: dict[str, Any] = {"arms": arms, "vary": vary}
     again = correlations(drawn_again(strata, level, 0))
     for name, point, values in zip(("correlation", "beyond"), correlations(sums), again, strict=True):
         row[name] = [None] * 3
         if np.isfinite(point) and (name, key) != ("beyond", SO_FAR):
             limits = np.percentile(values[np.isfinite(values)], [2.5, 97.5])
             row[name] = [round(float(x), 4) for x in (point, *limits)]
+            if vary < ENOUGH:  # a bootstrap of so few says nothing
+                row[name][1:] = None, None
     change = seeds_change_places if level == LEVELS[0] else arms_change_places
     tested = key != SO_FAR and row["correlation"][0] is not None
     return row | {"p": round(p_value(strata, change, 0), 7) if tested else None, "holm": None}
+
+
+def _varying(strata: Sequence[Stratum], level: str) -> int:
+    """The arms of whose runs the predictor tells some apart; across arms, those that are not as most are."""
+    if level == LEVELS[0]:
+        return sum(bool(np.ptp(one.x)) for one in strata)
+    _, counts = np.unique(np.concatenate([one.x for one in strata]), return_counts=True)
+    return int(counts.sum() - (counts.max() if counts.max() > 1 else 0))
 
 
 def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
@@ -231,7 +243,7 @@ def verdict(rows: Sequence[Mapping[str, Any]]) -> str:
         return "no: another sign"
     (sign,) = signs
     beyond = all(
-        row["beyond"][0] is not None and min(sign * x for x in row["beyond"][1:]) > 0 for row in rows
+        row["beyond"][1] is not None and min(sign * x for x in row["beyond"][1:]) > 0 for row in rows
     )
     return "yes, beyond the return so far" if beyond else "yes"
 
@@ -240,12 +252,14 @@ def tables(rows: Sequence[Mapping[str, Any]]) -> str:
     """The numbers as Markdown."""
 
     def limits(of: Sequence[float | None]) -> str:
-        return "-" if of[0] is None else f"{of[0]:+.2f} [{of[1]:+.2f}, {of[2]:+.2f}]"
+        if of[0] is None:
+            return "-"
+        return f"{of[0]:+.2f}" + ("" if of[1] is None else f" [{of[1]:+.2f}, {of[2]:+.2f}]")
 
     parts = [f"{sum(row['holm'] is not None for row in rows)} tests; p is Holm's over all of them."]
     head = ["key"]
     for game in GAMES:
-        head += [game, "p", "beyond the return so far", "arms"]
+        head += [game, "p", "beyond the return so far", "varies in"]
     for level in LEVELS:
         for moment in MOMENTS:
             lines = []
@@ -262,7 +276,12 @@ def tables(rows: Sequence[Mapping[str, Any]]) -> str:
                         if row["holm"] >= 0.001
                         else "< 0.001"
                     )
-                    line += [limits(row["correlation"]), p, limits(row["beyond"]), str(row["arms"])]
+                    line += [
+                        limits(row["correlation"]),
+                        p,
+                        limits(row["beyond"]),
+                        f"{row['vary']} of {row['arms']} arms",
+                    ]
                 lines.append([*line, verdict(its)])
             title = f"**{level[0].upper()}{level[1:]}, at {moment:,} env steps**"
             parts.append(f"{title}\n\n{texts.markdown([*head, 'predicts'], lines)}")
@@ -284,7 +303,8 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
             (colour, shift), (point, low, high) = looks[row["moment"]], row["correlation"]
             at = keys.index(row["key"]) + shift
             filled = row["holm"] is not None and row["holm"] < LEVEL
-            axes.plot([low, high], [at, at], color=colour, linewidth=1.4)
+            if low is not None:
+                axes.plot([low, high], [at, at], color=colour, linewidth=1.4)
             axes.plot(
                 [point], [at], "o", color=colour, markersize=5, markerfacecolor=colour if filled else "white"
             )

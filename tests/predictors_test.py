@@ -82,6 +82,17 @@ def test_an_effect_of_arms_is_none_within_them(few):
     assert found["correlation"][0] == 1 and found["p"] < 0.002 and found["arms"] == 8
 
 
+def test_what_varies_in_few_arms_has_no_interval(few):
+    rng = np.random.default_rng(0)
+    strata = [_stratum(rng, range(5), 1) for _ in range(6)]
+    strata = strata[:4] + [one._replace(x=np.zeros(5)) for one in strata[4:]]
+    found = predictors._row(strata, "within arms", KEY)
+    assert (found["vary"], found["arms"]) == (4, 6)
+    assert found["correlation"][0] > 0.5 and found["correlation"][1:] == [None, None]
+    assert predictors._varying([strata[0]], "across arms") == 5
+    assert predictors._varying([strata[0], strata[4]], "across arms") == 5
+
+
 @pytest.fixture
 def arms(tmp_path):
     """Three arms a game in two campaigns, whose ranks say what their returns will be at the end."""
@@ -128,7 +139,7 @@ def test_what_predicts_is_found_and_drawn(arms, few, monkeypatch, tmp_path):
     assert json.dumps(rows) == json.dumps(predictors.analyse(arms)) and len(rows) == 2 * 2 * 2 * 4
     its = {key: [row for row in rows if row["key"] == key] for key in (*predictors.KEYS, predictors.SO_FAR)}
     assert all(row["correlation"][0] == 1 for row in its[KEY])
-    assert all(row["correlation"] == [-1, -1, -1] for row in its["diag/drift/cka"])
+    assert all(row["correlation"] == [-1, -1, -1] and row["vary"] == 6 for row in its["diag/drift/cka"])
     assert all(row["correlation"][0] is None and row["p"] is None for row in its["diag/error/*/static"])
     assert all(row["holm"] is None for row in its[predictors.SO_FAR])
     text = predictors.tables(rows)
