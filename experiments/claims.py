@@ -173,7 +173,9 @@ def analyse(arms: Sequence[populations.ChosenArm]) -> dict[str, Any]:
         for rule in RULES:
             rates = np.array([rates[rule] for rates in each.values()])
             mean, low, high, _ = statistics.mean_interval(rates)
-            rows[rule] = {"share": _round(mean), "low": _round(low), "high": _round(high)}
+            limits = {"low": low, "high": high}  # none where all arms are alike
+            rows[rule] = {"share": _round(mean)}
+            rows[rule] |= {name: None if np.isnan(x) else _round(x) for name, x in limits.items()}
             rows[rule]["arms"] = {f"{game} {arm}": _round(rates[i]) for i, (game, arm) in enumerate(areas)}
         sums = {
             (mine, theirs): seen_again(areas[mine], areas[theirs], seeds, rng)
@@ -216,8 +218,9 @@ def _round(value: float, digits: int = 4) -> float:
 def tables(found: Mapping[str, Any]) -> str:
     """The numbers as Markdown."""
 
-    def percent(row: Mapping[str, float], of: str) -> str:
-        return f"{100 * row[of]:.1f} % ({100 * row['low']:.1f} to {100 * row['high']:.1f})"
+    def percent(row: Mapping[str, Any], of: str) -> str:
+        limits = "" if row["low"] is None else f" ({100 * row['low']:.1f} to {100 * row['high']:.1f})"
+        return f"{100 * row[of]:.1f} %{limits}"
 
     parts = []
     for seeds in map(str, SEEDS):
@@ -273,7 +276,9 @@ def draw(found: Mapping[str, Any], path: Path) -> Path:
             axes[0].plot(
                 each, [at] * len(each), "o", color=colour, alpha=0.25, markersize=4, markeredgewidth=0
             )
-            axes[0].plot([100 * max(row["low"], 0), 100 * row["high"]], [at, at], color=colour, linewidth=2)
+            if row["low"] is not None:
+                limits = [100 * row["low"], 100 * row["high"]]
+                axes[0].plot(limits, [at, at], color=colour, linewidth=2)
             label = f"{seeds} seeds an arm" if not i else None
             axes[0].plot([100 * row["share"]], [at], "o", color=colour, markersize=6, label=label)
             again = found["again"][seeds][rule]["claimed again"]

@@ -9,6 +9,9 @@ from experiments import claims
 from experiments.runs import populations
 from srl_jax import data, statistics
 
+SCORES = {"DER, 100 runs": (-20.0, 1.0, -20.0), "SPR, 100 runs": (-18.0, 2.0, -18.2)}
+"""Mean, standard deviation, median."""
+
 
 @pytest.fixture
 def few(monkeypatch):
@@ -49,6 +52,20 @@ def test_false_claims_are_of_all_pairs_of_groups():
     assert found["Welch's t"] == pytest.approx(1 / 3)  # the one pair that tells them apart
 
 
+def test_bootstraps_of_three_runs_are_apart_where_the_runs_are(few, monkeypatch):
+    """A draw of the lowest run three times has 1 of 27, more than 2.5 %: the intervals go from run to run."""
+    monkeypatch.setattr(claims, "REPETITIONS", 10_000)
+    runs = np.random.default_rng(0).normal(size=6)
+    found = claims.of_nothing(runs, 3, np.random.default_rng(0))
+    assert found["bootstraps apart"] == pytest.approx(1 / 10)
+    monkeypatch.setattr(claims, "SEEDS", (3,))
+    monkeypatch.setattr(populations, "areas", lambda arm: np.arange(10.0) + arm.runs[0])
+    monkeypatch.setattr(data, "atari100k", lambda method: {"Pong": data.Score100k(*SCORES[method], 100)})
+    alike = [populations.ChosenArm("x", "Catch", f"{i}", [i] * 10) for i in range(3)]
+    row = claims.analyse(alike)["nothing"]["3"]["bootstraps apart"]
+    assert (row["share"], row["low"]) == (0.1, None)
+
+
 def test_fresh_runs_look_again(few):
     rng = np.random.default_rng(0)
     far = claims.seen_again(rng.normal(size=6), 100 + rng.normal(size=6), 3, rng)
@@ -73,9 +90,9 @@ def test_all_of_it_is_written_alike_each_time(few, monkeypatch, tmp_path):
     arms.append(populations.ChosenArm("x", "Catch", "few", [None] * 5))
     monkeypatch.setattr(populations, "areas", lambda arm: values["abc".index(arm.name)])
     monkeypatch.setattr(claims, "SEEDS", (5,))
-    scores = {method: {"Pong": data.atari100k(method)["Pong"]} for method in claims.METHODS}
-    monkeypatch.setattr(data, "atari100k", scores.get)
+    monkeypatch.setattr(data, "atari100k", lambda method: {"Pong": data.Score100k(*SCORES[method], 100)})
     found = claims.analyse(arms)
+    json.dumps(found, allow_nan=False)
     assert json.dumps(found) == json.dumps(claims.analyse(arms))
     assert found["nothing"]["5"]["Welch's t"]["arms"].keys() == {"Catch a", "Catch b", "Catch c"}
     assert claims.tables(found).count("\n| ") == 4 * 2 + 3 * 5 + 3  # heads, rules, intervals
