@@ -58,12 +58,15 @@ def test_bootstraps_of_three_runs_are_apart_where_the_runs_are(few, monkeypatch)
     runs = np.random.default_rng(0).normal(size=6)
     found = claims.of_nothing(runs, 3, np.random.default_rng(0))
     assert found["bootstraps apart"] == pytest.approx(1 / 10)
-    monkeypatch.setattr(claims, "SEEDS", (3,))
-    monkeypatch.setattr(populations, "areas", lambda arm: np.arange(10.0) + arm.runs[0])
+
+
+def test_of_arms_that_are_all_alike_a_rate_has_no_interval(few, monkeypatch):
+    monkeypatch.setattr(claims, "SEEDS", (5,))
+    monkeypatch.setattr(populations, "areas", lambda arm: np.arange(10.0) + 100 * arm.runs[0])
     monkeypatch.setattr(data, "atari100k", lambda method: {"Pong": data.Score100k(*SCORES[method], 100)})
     alike = [populations.ChosenArm("x", "Catch", f"{i}", [i] * 10) for i in range(3)]
-    row = claims.analyse(alike)["nothing"]["3"]["bootstraps apart"]
-    assert (row["share"], row["low"]) == (0.1, None)
+    row = claims.analyse(alike)["nothing"]["5"]["Welch's t"]
+    assert 0 < row["share"] < 0.1 and row["low"] is None and row["high"] is None
 
 
 def test_fresh_runs_look_again(few):
