@@ -31,8 +31,8 @@ others do not; experiments/results/coverage has the whole table):
 
 That Welch's interval leaves out 0 is therefore a two-sided test at about 5 %, at worst at 8 %, from 3 runs on
 and nearly so from 2. That a bootstrap interval does is none with few runs: its kind says so below `ENOUGH` of
-them. Where runs are of two kinds, no interval of the mean of 2 to 5 of them holds what it says. How many runs a
-difference takes is what `welch_power`, `smallest_effect` and `runs_needed` say.
+them. Where runs are of two kinds, no interval of the mean of 2 to 5 of them holds what it says. `welch_power`,
+`smallest_effect` and `runs_needed` say how many runs a difference takes.
 """
 
 from srl_jax.statistics.aggregates import (
