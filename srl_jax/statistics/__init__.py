@@ -14,7 +14,7 @@ for what is no mean. An `Interval` says which it is. A single run has none: its 
 With few runs the bootstrap is too narrow. Of intervals at 95 %, this share contains the truth, in percent
 (`python -m experiments.coverage`: up to 10,000 simulated experiments each; Atari: distributions like those of
 DER's 100 published runs; Catch: residuals of 185 runs; "two kinds": runs of which 30 % learn the game and the
-others do not; experiments/results/coverage has the whole table):
+others do not; experiments/results/coverage has the table):
 
     runs of each game                               2    3    5    7   10   20
     Catch, mean, bootstrap                         49   74   84   87   89   92
@@ -31,8 +31,8 @@ others do not; experiments/results/coverage has the whole table):
 
 That Welch's interval leaves out 0 is therefore a two-sided test at about 5 %, at worst at 8 %, from 3 runs on
 and nearly so from 2. That a bootstrap interval does is none with few runs: its kind says so below `ENOUGH` of
-them. Where runs are of two kinds, no interval of the mean of 2 to 5 of them holds what it says. `welch_power`,
-`smallest_effect` and `runs_needed` say how many runs a difference takes.
+them. Where runs are of two kinds, no interval of the mean of 2 to 5 of them holds what it says.
+`welch_power`, `smallest_effect` and `runs_needed` say how many runs a difference takes.
 """
 
 from srl_jax.statistics.aggregates import (
