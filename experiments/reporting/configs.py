@@ -20,7 +20,7 @@ THEN = ", then "
 
 
 def about(run: RunData) -> dict[str, str]:
-    """What a run was made by: "git_revision", "cpus", "cores", "started", the versions of packages; no empty ones.
+    """What a run was made by: revision, CPUs, cores, versions of packages, "started"; no empty ones.
 
     Of a run that was resumed under other versions or elsewhere, each is there in turn: `1.2, then 1.3`.
 

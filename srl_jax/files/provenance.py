@@ -23,13 +23,14 @@ ABOUT = (*MADE_BY, "started", "continued")
 
 
 def made_by() -> dict[str, Any]:
-    """What config.json says of this process: software, how many CPUs the machine has, how many are for it."""
+    """What config.json says of this process: software, how many CPUs there are, and how many for it."""
     values = versions(), git_revision(), told_to_xla(), os.cpu_count(), cores()
     return dict(zip(MADE_BY, values, strict=True))
 
 
 def cores() -> int | None:
-    """On how many CPUs this process may run, by its affinity: XLA has as many threads, and roundings follow."""
+    """On how many CPUs this process may run, by its affinity; XLA has as many threads, on which roundings
+    depend."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
@@ -39,7 +40,7 @@ def now() -> str:
 
 
 def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What made a run: {package, environment variable, "git_revision", "cpus" or "cores": its values, oldest first}.
+    """What made a run: {what: its values, oldest first}, of packages, environment variables, and the rest.
 
     Args:
         about: the content of config.json. What it does not say at all is left out.
