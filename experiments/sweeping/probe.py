@@ -42,12 +42,10 @@ def measured(root: Path, entries: Mapping[str, Entry], how: Mapping[str, Any]) -
     for kind in dict.fromkeys(status.alike(entry.config) for entry in entries.values()):
         if kind in here:
             continue
-        like = [
-            entry
-            for entry in entries.values()
-            if status.alike(entry.config) == kind and not entry.run.sources
-        ]
-        own = {entry.config.game: entry for entry in like}  # one of each game
+        own: dict[str, Entry] = {}  # one of each game
+        for entry in entries.values():
+            if status.alike(entry.config) == kind and not entry.run.sources:
+                own.setdefault(entry.config.game, entry)
         chosen = list(own.values())[: how["workers"] or launching.most_workers(how["cpus_per_run"])]
         if chosen:
             found[kind] = _measure(chosen, how)
