@@ -195,7 +195,14 @@ def test_tables_have_every_number_and_what_it_is(runs):
     head = next(line for line in text.splitlines() if line.startswith("| game"))
     assert row in text.splitlines() and head.count("|") == row.count("|")
     assert "last evaluation, 10 games" in text and "2 games: 1 within, 1 above, 0 below" in text
-    assert "env steps 100,000 (here 200)" in text and "too narrow" in text
+    assert "env steps 100,000 (here 200)" in text and "too narrow" in text and "games cut" not in text
+
+
+def test_games_that_are_cut_earlier_than_the_published_ones_are_said(tmp_path):
+    finished(tmp_path / "Pong/der/seed0", -2.0, game="Pong", eval_max_steps=100, eval_games=1)
+    arm = evaluated(tmp_path, ["Pong"])["arms"]["der"]
+    assert arm["differs"][RERUN].startswith("games cut after 27,000 env steps (here 100); env steps 100,000")
+    assert arm["of"] == ["last evaluation, 1 game"]
 
 
 def test_every_preset_of_the_literature_has_published_scores_beside_it():

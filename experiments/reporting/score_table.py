@@ -98,7 +98,8 @@ def _notes(numbers: Mapping[str, Any]) -> list[str]:
     for arm, entry in numbers["arms"].items():
         cores = ", ".join(str(n or "not known") for n in entry["cores"])
         text = f"{arm}: {len(entry['games'])} games, {entry['steps']:,} env steps; {'; '.join(entry['of'])}"
-        found.append(f"- {text}; cores of a run: {cores}; revision {', '.join(entry['revisions'])}.")
+        revisions = ", ".join(revision[:10] for revision in entry["revisions"])
+        found.append(f"- {text}; cores of a run: {cores}; revision {revisions}.")
         verdicts = [x["verdict"] for x in entry["games"].values() if x["verdict"]]
         if verdicts:
             counts = ", ".join(f"{verdicts.count(kind)} {kind}" for kind in ("within", "above", "below"))

@@ -18,6 +18,8 @@ from .run_data import RunData
 
 STEPS = 100_000
 """Env steps after which the published scores are taken."""
+CUT = 27_000
+"""Env steps after which games of the published scores are cut: 108,000 frames."""
 FAR = 2.0
 """In standard deviations over published runs: how far beyond published means is still within them."""
 BESIDE = {
@@ -47,7 +49,8 @@ class Score(NamedTuple):
     @property
     def of(self) -> str:
         """Of what it is the mean."""
-        return f"{self.games} games at the end" if self.final else f"last evaluation, {self.games} games"
+        games = f"{self.games} game{'' if self.games == 1 else 's'}"
+        return f"{games} at the end" if self.final else f"last evaluation, {games}"
 
 
 def beside(preset: str) -> tuple[str, ...]:
@@ -188,7 +191,10 @@ def _differs(name: str, members: Mapping[str, Sequence[RunData]]) -> str:
     for game, runs in members.items():
         rows = [row for row in data.published(game) if (row.method, row.env_steps) == (name, STEPS)]
         if rows:
-            return collect.differs(rows[0], runs[0].config, seeds=len(runs))
+            text = collect.differs(rows[0], runs[0].config, seeds=len(runs))
+            if (cut := runs[0].config.eval_max_steps) != CUT:
+                text = f"games cut after {CUT:,} env steps (here {cut:,}){'; ' if text else ''}{text}"
+            return text
     return "no score of these games"
 
 
