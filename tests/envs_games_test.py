@@ -117,9 +117,9 @@ def test_a_list_that_was_cut_at_commas():
 
 
 def test_suites_are_of_atari_games_and_as_large_as_their_names_say():
-    for name, games in envs.SUITES.items():
-        assert set(games) <= set(envs.ATARI_57) and len(set(games)) == len(games)
-        assert not name.isdigit() or len(games) == int(name)
+    for name, its in envs.SUITES.items():
+        assert set(its) <= set(envs.ATARI_57) and len(set(its)) == len(its)
+        assert not name.isdigit() or len(its) == int(name)
     assert set(envs.SUITES["3"]) < set(envs.SUITES["5"])
     assert set(envs.SUITES["signed"]) < set(envs.SUITES["26"])
 
