@@ -49,13 +49,14 @@ def make_losses(
                 seen, online, opens = rl_seen, rl_online, mode.rl_trains_encoder
                 if target:
                     online = _later(online, encoded(encoder, params["encoder"], target))
+            read = objective.read(params)
             own = state.slow.get(name, {"encoder": {}, "head": None})
             lagged = own["encoder"] if jax.tree.leaves(own["encoder"]) else params["encoder"]
             of = partial(make_latents, encoder, params["encoder"], lagged)
             latents = Latents(online, frozen(encoded(encoder, lagged, target or seen)), of)
             losses[name], metrics[name] = objective.loss(
-                params[name],
-                own["head"],
+                objective.head(params[name], read if opens else jax.lax.stop_gradient(read)),
+                objective.head(own["head"], own.get("read", {})),
                 latents if opens else shut(latents),
                 seen.window,
                 named_key(key, name),
