@@ -1,5 +1,7 @@
 """Two views of one observation: BYOL, VICReg and Barlow Twins."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -8,6 +10,17 @@ from srl_jax.objectives.networks import MLP, cosine_distance, functions
 from srl_jax.specs import check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.update import ema
+from srl_jax.window import only
+
+
+def two_views(draw: Callable, latents: Latents, window: Window, key: jax.Array) -> Latents:
+    """The latents of two views of s_t at offset 0, those of the first before those of the second: [2B, D].
+
+    They go through encoder and heads as one batch, which is faster than one after the other.
+    """
+    now = only(window, 0)
+    views = [draw(now, k) for k in jax.random.split(key)]
+    return latents.of(jax.tree.map(lambda *x: jnp.concatenate(x), *views))
 
 
 def byol(
@@ -45,14 +58,11 @@ def byol(
         return {"projection": init_project(first), "predictor": init_predict(second)}
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        one, other = (latents.of(draw(window, k)) for k in jax.random.split(key))
-
-        def between(seen: Latents, wanted: Latents) -> jax.Array:
-            prediction = predict(head["predictor"], project(head["projection"], seen.online(0)))
-            target = jax.lax.stop_gradient(project(slow_head["projection"], wanted.slow(0)))
-            return jax.vmap(cosine_distance)(prediction, target)
-
-        return (between(one, other) + between(other, one)) / 2, {}
+        both = two_views(draw, latents, window, key)
+        prediction = predict(head["predictor"], project(head["projection"], both.online(0)))
+        target = jax.lax.stop_gradient(project(slow_head["projection"], both.slow(0)))
+        crossed = jnp.roll(target, len(target) // 2, 0)  # each view's target is the other's
+        return jnp.mean(jax.vmap(cosine_distance)(prediction, crossed).reshape(2, -1), 0), {}
 
     return Objective(init, loss, weight, slow=ema(tau))
 
@@ -101,7 +111,7 @@ def vicreg(
     init, expand = functions(MLP(hidden, outputs), context.features)
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        z = [expand(head, latents.of(draw(window, k)).online(0)) for k in jax.random.split(key)]
+        z = jnp.split(expand(head, two_views(draw, latents, window, key).online(0)), 2)
         alike = jnp.mean((z[0] - z[1]) ** 2, -1)
         varied = sum(map(variance_loss, z))
         apart = sum(map(covariance_loss, z))
@@ -146,7 +156,7 @@ def barlow(
     init, project = functions(MLP(hidden, outputs), context.features)
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        first, second = (project(head, latents.of(draw(window, k)).online(0)) for k in jax.random.split(key))
+        first, second = jnp.split(project(head, two_views(draw, latents, window, key).online(0)), 2)
         correlation = cross_correlation(first, second)
         identity = jnp.eye(outputs, dtype=jnp.float32)
         factor = identity + redundancy * (1 - identity)
