@@ -71,6 +71,10 @@ class Encoder(NamedTuple):
             where there is none, or it is not known.
         steps: what `apply` computes, step by step, for a program without this one, see
             `srl_jax.encoders.files.to_npz`; None where nothing says it.
+        make_tied_decoder: () -> Decoder whose convolutions have the transposes of the encoder's kernels; None
+            where there is none.
+        train: (params, observations as of `apply`, key) -> latents as the losses of an update see them, with
+            noise of the key; None where they are those of `apply`.
     """
 
     init: Callable[[jax.Array], Params]
@@ -80,13 +84,19 @@ class Encoder(NamedTuple):
     make_decoder: MakeDecoder | None
     map_shape: tuple[int, ...] | None = None
     steps: Sequence[Mapping[str, Any]] | None = None
+    make_tied_decoder: Callable[[], Decoder] | None = None
+    train: Callable[[Params, Array, jax.Array], jax.Array] | None = None
 
 
 class Decoder(NamedTuple):
-    """A decoder, pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S * C]."""
+    """A decoder, pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S * C].
+
+    What it `reads` of other groups is among the params of apply, as an objective's of `Objective.reads`.
+    """
 
     init: Callable[[jax.Array], Params]
     apply: Callable[[Params, Array], jax.Array]
+    reads: Mapping[str, Callable[[Params], Params]] = MappingProxyType({})
 
 
 class MakeDecoder(Protocol):
@@ -127,7 +137,7 @@ class Context(NamedTuple):
         features: D, the latent's size.
         num_actions: A.
         make_decoder: as of `Encoder`; raises ValueError where there is no decoder.
-        map_shape: as of `Encoder`.
+        map_shape, make_tied_decoder: as of `Encoder`.
         rl_layer: the first layer of RL's head, where RL is trained and its head has one that reads latents.
     """
 
@@ -135,12 +145,14 @@ class Context(NamedTuple):
     num_actions: int
     make_decoder: MakeDecoder = no_decoder
     map_shape: tuple[int, ...] | None = None
+    make_tied_decoder: Callable[[], Decoder] | None = None
     rl_layer: Layer | None = None
 
     @classmethod
     def of(cls, encoder: Encoder, num_actions: int) -> Context:
         """The context of objectives over an encoder."""
-        return cls(encoder.features, num_actions, encoder.make_decoder or no_decoder, encoder.map_shape)
+        decoder = encoder.make_decoder or no_decoder
+        return cls(encoder.features, num_actions, decoder, encoder.map_shape, encoder.make_tied_decoder)
 
 
 def no_other_window(window: Window) -> Latents:

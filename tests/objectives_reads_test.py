@@ -5,16 +5,33 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import objectives, rl, specs
+from srl_jax import encoders, objectives, rl, specs
 from srl_jax.agent import components
+from srl_jax.augment import UNCHANGED
 from srl_jax.config import Config
+from srl_jax.diagnostics.functions import make_functions
+from srl_jax.encoders.convolutional import Layer, convolutional_encoder
+from srl_jax.encoders.options import End, Start
+from srl_jax.latents import make_losses
+from srl_jax.layers import Conv, ConvTranspose
 from srl_jax.modes import MODES
 from srl_jax.optim import RL, RL_SRL, make_optimizer
 from srl_jax.resets import reset
-from srl_jax.types import Objective
+from srl_jax.types import Context, Objective, TrainState
 from srl_jax.update import Hyper, make_init, make_update, passes
 from tests import helpers
-from tests.helpers import NUM_ACTIONS, all_zero, draw, jit, latents_of, make_context, make_encoder, make_window
+from tests.helpers import (
+    NUM_ACTIONS,
+    SIZE,
+    STACK,
+    all_zero,
+    draw,
+    jit,
+    latents_of,
+    make_context,
+    make_encoder,
+    make_window,
+)
 
 BATCH, D, STEPS = 4, 5, 2
 RATES = dict.fromkeys(("encoder", "encoder_srl", RL, "representation"), np.float32(0.01))
@@ -110,7 +127,9 @@ def test_what_the_gradients_of_two_passes_are_added_up_over():
     # Both losses reach the layer: one Adam's first step has the sign of the sum, and RL's is the larger.
     reads = {RL: lambda head: {"w": head["w"]}}
     term = Objective(lambda key: {}, lambda head, *_: (jnp.ones(BATCH) * 2 * head[RL]["w"], {}), reads=reads)
-    of_rl = Objective(lambda key: {"w": jnp.zeros(())}, lambda head, *_: (-3 * jnp.ones(BATCH) * head["w"], {}))
+    of_rl = Objective(
+        lambda key: {"w": jnp.zeros(())}, lambda head, *_: (-3 * jnp.ones(BATCH) * head["w"], {})
+    )
     terms, mode = {RL: of_rl, "two": term}, MODES["joint"]
     moved = {}
     for form, gate in (("summed", "sum"), ("summed", "pcgrad"), ("simultaneous", "pcgrad")):
@@ -162,3 +181,76 @@ def test_spr_is_refused_a_layer_that_there_is_not(values, told):
         components(config, (42, 42, 1), NUM_ACTIONS)
     assert told in str(error.value) and str(error.value).startswith("--objective=spr:projection=r")
     assert "\n" not in str(error.value)
+
+
+# A decoder with the encoder's kernels
+
+
+def test_a_tied_decoder_by_hand():
+    # z = 2 s and an image of 2 z = 4 s, at s = 1: (4 - 1)^2 = 9. Of w^2 s the slope in w is 2 w, so that the
+    # loss' is 2 (4 - 1) 2 2 = 24; through one use alone it would be half of it.
+    encoder = convolutional_encoder((1, 1, 1), [Layer(1, 1, 1)], Start(), End())
+    objective = objectives.reconstruction(Context.of(encoder, 2), tied=True)
+    assert objective.init(jax.random.key(0)) == {"ConvTranspose_0": {"bias": pytest.approx(0, abs=1)}}
+    window = make_window(horizon=1, size=1)._replace(frames=np.full((BATCH, 2, 1, 1, 1), 255, np.uint8))
+    terms = {"reconstruction": objective}
+    state = TrainState(
+        {
+            "encoder": {"Conv_0": {"kernel": np.full((1, 1, 1, 1), 2, np.float32), "bias": np.zeros(1)}},
+            "reconstruction": {"ConvTranspose_0": {"bias": np.zeros(1, np.float32)}},
+        },
+        {}, None, np.int32(0), jax.random.key(0),
+    )  # fmt: skip
+    for opens, slope in ((True, 24.0), (False, 0.0)):
+        mode = MODES["pretrain"]._replace(representation_trains_encoder=opens)
+        losses_of = make_losses(encoder, terms, mode, views=UNCHANGED)
+        loss = lambda params: jnp.mean(losses_of(params, state, window)[0]["reconstruction"])  # noqa: B023, E731
+        value, gradient = jit(jax.value_and_grad(loss))(state.params)
+        assert float(value) == pytest.approx(9)
+        assert float(gradient["encoder"]["Conv_0"]["kernel"].sum()) == pytest.approx(slope)
+
+
+@pytest.mark.parametrize(("name", "size"), [("nature:padding=same", 21), ("der", 23), ("tiny", 19)])
+def test_a_tied_decoders_convolutions_are_the_transposes_of_the_encoders(name, size):
+    spec = specs.parse(name, encoders.REGISTRY)
+    encoder = specs.build(spec, encoders.REGISTRY, (size, size, 2))
+    decoder = encoder.make_tied_decoder()
+    params = helpers.random_params(encoder.init)
+    ((group, part),) = decoder.reads.items()
+    kernels = part(params)
+    shapes = jax.eval_shape(encoder.make_decoder().init, jax.random.key(0))
+    assert group == "encoder" and len(kernels) == sum(layer.startswith("Conv_") for layer in params)
+    for i, layer in enumerate(sorted(kernels)):
+        of = params[f"Conv_{len(kernels) - 1 - i}"]["kernel"]
+        assert kernels[layer]["kernel"].shape == shapes[layer]["kernel"].shape
+        np.testing.assert_array_equal(kernels[layer]["kernel"], of.swapaxes(2, 3))
+    # What a convolution takes from a pixel its transpose gives back to it: the adjoint, <C x, y> = <x, C' y>.
+    side, stride = of.shape[0], {"nature": 4, "der": 5, "tiny": 4}[spec.name]
+    x, conv = draw(1, 3 * stride + side, 3 * stride + side, of.shape[2]), Conv(of.shape[3], side, stride)
+    zero = {"bias": np.zeros(of.shape[3], np.float32)}
+    forward = lambda x: conv.apply({"params": {"kernel": of, **zero}}, x)  # noqa: E731
+    y = draw(*forward(x).shape, seed=1)
+    back = ConvTranspose(of.shape[2], side, stride, x.shape[1:3])
+    tied = {"kernel": of.swapaxes(2, 3), "bias": np.zeros(of.shape[2], np.float32)}
+    (wanted,) = jax.vjp(forward, x)[1](y)
+    np.testing.assert_allclose(back.apply({"params": tied}, y), wanted, rtol=1e-4, atol=1e-4)
+
+
+def test_a_tied_decoder_needs_plain_convolutions():
+    for encoder in (make_encoder(), encoders.impala((12, 12, 4))):
+        with pytest.raises(ValueError, match="^tied=true needs an encoder of plain convolutions"):
+            objectives.reconstruction(Context.of(encoder, 3), tied=True)
+
+
+def test_pictures_and_decoder_errors_of_a_tied_decoder_are_made_by_the_encoders_kernels():
+    encoder = convolutional_encoder((SIZE, SIZE, STACK), [Layer(2, 3, 1)], Start(), End(), features=3)
+    terms = {"reconstruction": objectives.reconstruction(Context.of(encoder, 3), tied=True)}
+    functions = make_functions(encoder, terms, MODES["pretrain"], channels=1)
+    assert functions.groups == ("encoder", "reconstruction") and not functions.others
+    init = make_init(encoder, terms, MODES["pretrain"], make_optimizer(terms))
+    params, window = helpers.random_state(init).params, make_window(horizon=1)
+    z = draw(BATCH, 3)
+    errors, _, _ = functions.decode["reconstruction"](params, z, window)
+    kernels = jax.tree.map(lambda x: 2 * x, params["encoder"])
+    others, _, _ = functions.decode["reconstruction"](params | {"encoder": kernels}, z, window)
+    assert errors.shape == (BATCH,) and not np.allclose(errors, others)

@@ -31,7 +31,9 @@ def pictures(agent: Agent, params: Any, replay: Replay, beta: float) -> dict[str
 
     def draw(params, window):
         latents = make_latents(agent.encoder, params["encoder"], params["encoder"], window)
-        heads = {name: objective.head(params[name], objective.read(params)) for name, objective in drawn.items()}
+        heads = {
+            name: objective.head(params[name], objective.read(params)) for name, objective in drawn.items()
+        }
         return {name: drawn[name].image(head, latents, window) for name, head in heads.items()}
 
     made = jax.device_get(jax.jit(draw)(params, window))
