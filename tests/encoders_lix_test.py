@@ -18,8 +18,10 @@ from srl_jax.update import make_init, passes
 from tests import helpers
 from tests.helpers import NUM_ACTIONS, SIZE, STACK, draw, jit, make_window
 
+MIXING = Mixing(1.0, 0.75)
 
-def small(lix: Mixing | None = Mixing(1.0, 0.75)) -> Encoder:
+
+def small(lix: Mixing | None) -> Encoder:
     return convolutional_encoder((SIZE, SIZE, STACK), [Layer(2, 3, 1)], Start(), End(), features=3, lix=lix)
 
 
@@ -84,7 +86,7 @@ def test_the_radius_goes_where_the_gradient_of_the_maps_is_as_smooth_as_the_goal
 
 
 def test_an_encoder_mixes_in_updates_alone():
-    encoder, plain = small(), small(None)
+    encoder, plain = small(MIXING), small(None)
     params = helpers.random_params(plain.init)
     mixing = params | {RADIUS: np.float32(1)}
     assert float(encoder.init(jax.random.key(0))[RADIUS]) == 1 and plain.train is None
@@ -100,7 +102,7 @@ def test_an_encoder_mixes_in_updates_alone():
 
 
 def test_one_objectives_noise_does_not_depend_on_what_others_ask_for():
-    encoder = small()
+    encoder = small(MIXING)
     context = Context.of(encoder, NUM_ACTIONS)
     terms = {
         "latent_l2": objectives.latent_l2(context),

@@ -108,8 +108,8 @@ def a_lix(
 def mrq(observation_shape: tuple[int, int, int], start: Start, end: End, *, features: int = 512) -> Encoder:
     """The encoder of MR.Q (Fujimoto et al. 2025, appendix B): four layers with ELU.
 
-    At 84 x 84 it sees all but the last 5 rows and columns. Its decoder has ELU, too, and is linear at the end;
-    the paper has none.
+    At 84 x 84 it sees all but the last 5 rows and columns. Its decoder has ELU, too, and is linear at the
+    end; the paper has none.
 
     Args:
         features: size of the linear layer, behind which the default end is LayerNorm and ELU; 0 leaves it

@@ -15,6 +15,7 @@ from srl_jax.encoders.options import End, Latent, Start
 from srl_jax.layers import Conv, ConvTranspose, Pads
 from srl_jax.optim import ENCODER
 from srl_jax.specs import check_choice
+from srl_jax.types import Array as AnyArray
 from srl_jax.types import Decoder, Encoder, Params
 
 ACTIVATIONS = {"relu": nn.relu, "elu": nn.elu}
@@ -59,7 +60,8 @@ class EncoderNetwork(nn.Module):
     @nn.compact
     def __call__(self, observation: Array, key: Array | None = None) -> Array:
         x = observation
-        radius = self.lix and self.param(RADIUS, lambda _: jnp.float32(self.lix.radius))
+        if self.lix:
+            radius = self.param(RADIUS, nn.initializers.constant(self.lix.radius, jnp.float32), ())
         init, zero_sum, gain, _ = self.start
         if x.dtype == jnp.uint8:
             gain /= 255.0
@@ -176,7 +178,7 @@ def tied(decoder: Decoder, layers: int) -> Decoder:
         drawn = decoder.init(key)
         return drawn | {name: {"bias": drawn[name]["bias"]} for name in mirrored}
 
-    def apply(params: Params, x: Array) -> Array:
+    def apply(params: Params, x: AnyArray) -> Array:
         return decoder.apply({name: tree | params[ENCODER].get(name, {}) for name, tree in params.items()}, x)
 
     return Decoder(init, apply, {ENCODER: transposed})

@@ -1,9 +1,10 @@
-"""Local signal mixing, the LIX layer of A-LIX: Cetin et al. (2022), Stabilizing Off-Policy Deep RL from Pixels.
+"""Local signal mixing, the LIX layer of A-LIX.
 
+Cetin et al. (2022), Stabilizing Off-Policy Deep Reinforcement Learning from Pixels, section 4.
 In an update the maps of a layer are moved by a random fraction of a pixel, up to a radius S. Gradients that
 reach a pixel of the maps are thereby those of its neighbours as well: they change smoothly over the maps,
 which keeps a critic from fitting its targets by patterns of single pixels. S is tuned so that the
-discontinuity of the gradients is what it is meant to be (section 4).
+discontinuity of the gradients is what it is meant to be.
 """
 
 from functools import partial
@@ -58,9 +59,9 @@ def mixed(x: Array, radius: Array, key: Array) -> Array:
 def discontinuity(gradient: Array) -> Array:
     """The normalised discontinuity of a gradient on maps: float32 [B, H, W, C] -> float32 [].
 
-    Of the batch's mean gradient, `log(1 + E (g' - g)^2 / E g'^2)`, over the eight neighbours g' of each pixel g,
-    a mean over pixels and maps: what the authors' code computes for the ND score of section 4.1. Behind the
-    border its pixels are repeated. 0 where there is no gradient.
+    Of the batch's mean gradient, `log(1 + E (g' - g)^2 / E g'^2)`, over the eight neighbours g' of each
+    pixel g, a mean over pixels and maps: what the authors' code computes for the paper's ND score. Behind
+    the border its pixels are repeated. 0 where there is no gradient.
     """
     g = jnp.mean(gradient, 0)
     g = g / jnp.maximum(jnp.max(jnp.abs(g)), 1e-30)  # squares of small gradients are 0 in float32
@@ -76,8 +77,8 @@ def discontinuity(gradient: Array) -> Array:
 def tuned(x: Array, radius: Array, goal: float) -> Array:
     """The maps as they are; the radius' gradient is `goal - discontinuity` of the gradient that they get.
 
-    An optimizer that goes down this gradient raises S where gradients are less smooth than the goal (the dual
-    objective of section 4.2). It is 0 with a goal of 0, where there is no gradient on the maps, and where S
+    An optimizer that goes down this gradient raises S where gradients are less smooth than the goal, the
+    paper's dual objective. It is 0 with a goal of 0, where there is no gradient on the maps, and where S
     would leave [0, `MOST`].
     """
     return x

@@ -1,5 +1,8 @@
 """Self-prediction: the latents of the next steps from the latent and the actions, without pixels."""
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -9,6 +12,7 @@ from srl_jax.specs import check_choice, check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.update import ema, periodic
 
+Rule: TypeAlias = Callable[[Params, Params, Array], Params]
 TARGETS = ("slow", "periodic", "stopped", "gradient")
 
 
@@ -68,7 +72,8 @@ def forward_latent(
     check_choice("distance", distance, DISTANCES)
     check_size("every", every)
     check_choice("target", target, TARGETS)
-    rule = {"slow": ema(tau), "periodic": periodic(every)}.get(target)
+    rules: dict[str, Rule] = {"slow": ema(tau), "periodic": periodic(every)}
+    rule = rules.get(target)
     init, apply = functions(LatentDynamics(hidden, residual), context.features, context.num_actions)
     between = jax.vmap(DISTANCES[distance])
 

@@ -141,8 +141,8 @@ def reconstruction(
     check_size("patch", patch)
     if tied and context.make_tied_decoder is None:
         raise ValueError(
-            "tied=true needs an encoder of plain convolutions, whose decoder mirrors each of them; give one, say "
-            "nature, or tied=false"
+            "tied=true needs an encoder of plain convolutions, whose decoder mirrors each of them; give one, "
+            "say nature, or tied=false"
         )
     decoder = context.make_tied_decoder() if tied and context.make_tied_decoder else context.make_decoder()
 

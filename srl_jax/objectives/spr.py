@@ -122,8 +122,8 @@ def _rl_layer(context: Context, hidden: int) -> Layer:
     """The first layer of RL's head."""
     if context.rl_layer is None:
         raise ValueError(
-            "projection=rl needs an RL head that is trained beside it and begins with a linear layer over the "
-            "latent, as those of all rows but iqn do; give projection=own"
+            "projection=rl needs an RL head that is trained beside it and begins with a linear layer over "
+            "the latent, as those of all rows but iqn do; give projection=own"
         )
     if hidden != HIDDEN:
         raise ValueError("with projection=rl the layer of RL's head has its own size; leave hidden out")

@@ -13,14 +13,13 @@ from srl_jax.update import ema
 from srl_jax.window import only
 
 
-def two_views(draw: Callable, latents: Latents, window: Window, key: jax.Array) -> Latents:
-    """The latents of two views of s_t at offset 0, those of the first before those of the second: [2B, D].
+def two_views(draw: Callable, latents: Latents, window: Window, key: jax.Array) -> list[Latents]:
+    """The latents of two views of s_t, which is their offset 0.
 
-    They go through encoder and heads as one batch, which is faster than one after the other.
+    The views are drawn of s_t's frames alone. Heads see both as one batch, [2B, D]; in the encoder, where a
+    batch is large enough as it is, one of twice the size is slower on a CPU.
     """
-    now = only(window, 0)
-    views = [draw(now, k) for k in jax.random.split(key)]
-    return latents.of(jax.tree.map(lambda *x: jnp.concatenate(x), *views))
+    return [latents.of(draw(only(window, 0), k)) for k in jax.random.split(key)]
 
 
 def byol(
@@ -58,11 +57,12 @@ def byol(
         return {"projection": init_project(first), "predictor": init_predict(second)}
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        both = two_views(draw, latents, window, key)
-        prediction = predict(head["predictor"], project(head["projection"], both.online(0)))
-        target = jax.lax.stop_gradient(project(slow_head["projection"], both.slow(0)))
-        crossed = jnp.roll(target, len(target) // 2, 0)  # each view's target is the other's
-        return jnp.mean(jax.vmap(cosine_distance)(prediction, crossed).reshape(2, -1), 0), {}
+        one, other = two_views(draw, latents, window, key)
+        z = jnp.concatenate([one.online(0), other.online(0)])
+        wanted = jnp.concatenate([other.slow(0), one.slow(0)])  # each view's target is the other's
+        prediction = predict(head["predictor"], project(head["projection"], z))
+        target = jax.lax.stop_gradient(project(slow_head["projection"], wanted))
+        return jnp.mean(jax.vmap(cosine_distance)(prediction, target).reshape(2, -1), 0), {}
 
     return Objective(init, loss, weight, slow=ema(tau))
 
@@ -111,7 +111,8 @@ def vicreg(
     init, expand = functions(MLP(hidden, outputs), context.features)
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        z = jnp.split(expand(head, two_views(draw, latents, window, key).online(0)), 2)
+        both = [view.online(0) for view in two_views(draw, latents, window, key)]
+        z = jnp.split(expand(head, jnp.concatenate(both)), 2)
         alike = jnp.mean((z[0] - z[1]) ** 2, -1)
         varied = sum(map(variance_loss, z))
         apart = sum(map(covariance_loss, z))
@@ -156,7 +157,8 @@ def barlow(
     init, project = functions(MLP(hidden, outputs), context.features)
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        first, second = jnp.split(project(head, two_views(draw, latents, window, key).online(0)), 2)
+        both = [view.online(0) for view in two_views(draw, latents, window, key)]
+        first, second = jnp.split(project(head, jnp.concatenate(both)), 2)
         correlation = cross_correlation(first, second)
         identity = jnp.eye(outputs, dtype=jnp.float32)
         factor = identity + redundancy * (1 - identity)

@@ -7,6 +7,7 @@ from jax import Array
 
 from srl_jax.layers import Dense, NoisyDense, factorised_noise
 from srl_jax.optim import RL
+from srl_jax.types import Array as AnyArray
 from srl_jax.types import Layer, Params
 
 
@@ -93,7 +94,7 @@ class QNetwork(nn.Module):
             return None
         names = ["hidden"] if self.shared_hidden else [f"{stream}_hidden" for stream in self._sizes]
 
-        def apply(part: Params, z: Array) -> Array:
+        def apply(part: Params, z: AnyArray) -> Array:
             return jnp.concatenate([z @ part[name]["kernel"] + part[name]["bias"] for name in names], -1)
 
         def means(head: Params) -> Params:
