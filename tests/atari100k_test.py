@@ -47,8 +47,8 @@ def test_presets_are_what_the_table_says(name):
     for kind in ("encoder", "rl"):
         own, options = split(getattr(config, kind))
         values |= {kind: own} | {f"{kind} {option}": text for option, text in options.items()}
-    for name, options in map(split, config.objectives):
-        values |= {f"{name} {option}": text for option, text in options.items()}
+    for own, options in map(split, config.objectives):
+        values |= {f"{own} {option}": text for option, text in options.items()}
     values["objective"] = " + ".join(split(text)[0] for text in config.objectives) or "-"
     for setting, wanted in TABLE[name].items():
         if wanted != "-":
