@@ -34,6 +34,7 @@ BESIDE = {
     "sr_spr": ("SR-SPR",),
     "bbf": ("BBF, replay ratio 2", "BBF"),
     "a_lix": ("A-LIX",),
+    "mrq": ("MR.Q",),
 }
 """{preset atari100k/NAME: the published methods that its runs are laid beside}, the same recipe first."""
 STRATIFIED = "stratified t"
