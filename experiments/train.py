@@ -19,7 +19,7 @@ from srl_jax import envs
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
-from srl_jax.files.resuming import all_to_resume, blank, going_on, is_run, say_anew
+from srl_jax.files.resuming import all_to_resume, blank, going_on, has_ended, is_run, say_anew
 from srl_jax.files.rundir import check_free, run_directory
 from srl_jax.training import check_game, check_sources, completed, resolved
 
@@ -141,7 +141,7 @@ def check_extras(config: Config) -> None:
 
 def say_unused(values: flags.FlagValues, game: str) -> None:
     """A line for each flag that was given and that the game's environments have no use for."""
-    for name in ("sticky_actions", "noop_max"):
+    for name in ("sticky_actions", "full_actions", "noop_max"):
         if values[name].present and name not in envs.game(game).options:
             display.say(f"--{name}: changes nothing, {game} has none")
 
@@ -197,14 +197,13 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     runtime.check_device()
     config = resolved(config)
 
-    from srl_jax.files import checkpoint
     from srl_jax.run import loop
     from srl_jax.run.schedules import printed
 
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs, completed) if resume else [None] * len(runs)
-    if all(m and (checkpoint.NUMBERS not in m.files or m.env_steps >= config.steps) for m in manifests):
+    if all(m and has_ended(where, m, c) for (where, c), m in zip(runs, manifests, strict=True)):
         print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
         return 0
     # A checkpoint has the encoder; the policy that others are pretrained on is read again.

@@ -194,6 +194,14 @@ class Config:
         int, 27_000, "length at which an evaluation game is cut (27,000 are 108,000 frames)", "env steps",
         minimum=1, maximum=specs.LIMITS[int] // envs.FRAME_SKIP,
     )  # fmt: skip
+    final_games: int = _value(
+        int, 0, "full games after the last env step, in a row of kind final; 0: none", "games",
+        minimum=0, maximum=1_000_000,
+    )  # fmt: skip
+    final_envs: int = _value(
+        int, 32, "environments that play the final games at once, one game or more each", "environments",
+        minimum=1, maximum=10_000,
+    )  # fmt: skip
     stop_at_return: float | None = _value(
         float, None, "mean evaluation return at which the run ends early, or off", "unclipped score",
         optional=True,
@@ -227,6 +235,9 @@ class Config:
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
     life_loss: bool = _value(bool, True, "a lost life ends the return, but not the game, in training")
     sticky_actions: float = _share(0.0, "the emulator repeats the last action with this probability")
+    full_actions: bool = _value(
+        bool, False, "all 18 actions of the joystick, instead of those that the game knows (Atari)"
+    )
     noop_max: int = _value(
         int,
         30,
@@ -426,7 +437,9 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
 
 
-MAY_CHANGE = ("steps", "stop_at_return", "keep_replay", "keep_best", "imports", "loggers")
+ENDS = ("steps", "stop_at_return")
+"""Fields that say when a run ends."""
+MAY_CHANGE = (*ENDS, "keep_replay", "keep_best", "imports", "loggers")
 """Fields that may change when a run is resumed: when it ends, what it leaves, its plug-ins and loggers."""
 
 

@@ -217,9 +217,27 @@ def all_to_resume(
                         f"{manifest.env_steps} env steps; --overwrite would start all of them anew"
                     )
             return [None] * len(runs)
-        if len(set(steps)) == 1:
+        # One that has ended, before the others had, can be resumed from its checkpoint before.
+        ended = {checkpoint.NUMBERS not in manifest.files for manifest in found if manifest is not None}
+        if len(set(steps)) == len(ended) == 1:
             return found
-        at_most = min(steps)
+        at_most = min(steps) - (len(set(steps)) == 1)
+
+
+def has_ended(path: Path, manifest: Manifest, wanted: Config) -> bool:
+    """Whether a run has done all that is wanted of it, so that there is nothing to resume.
+
+    Args:
+        path: its directory.
+        manifest: of its newest checkpoint, see `to_resume`.
+        wanted: its configuration, now.
+    """
+    if checkpoint.NUMBERS not in manifest.files:
+        return True
+    if manifest.env_steps < wanted.steps:
+        return False
+    ended = ending.read(path)  # a run of --keep_replay
+    return ended is not None and ended.status == "finished"
 
 
 def first_checkpoint(wanted: Config) -> int:

@@ -8,6 +8,7 @@ their own and are awaited before the next row is written. So no result depends o
 
 import contextlib
 import dataclasses
+from concurrent import futures
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +27,7 @@ from srl_jax.resets import reset, reset_key
 from srl_jax.run import ending
 from srl_jax.run.actor import make_env, yielding_threads
 from srl_jax.run.ending import Ending
+from srl_jax.run.evaluations import FINAL, Evaluating
 from srl_jax.run.schedules import Now, Schedules, passed
 from srl_jax.run.seed import Seed
 from srl_jax.types import Params
@@ -190,22 +192,24 @@ class Run:
                 drawn = pictures(self.agent, params, seed.replay, self.now.beta)
                 seed.report.pictures(self.env_steps, drawn)
                 counts = self.env_steps, self.updates, not finished, seed.saved and seed.saved.env_steps
-                results.append(Result(*counts, drawn, seed.recording))
+                results.append(Result(*counts, drawn, seed.evaluations.recording))
         return results
 
     def run(self) -> bool:
-        """To the last env step, or to the return that ends the run; False where it was told to stop."""
-        config, progress = self.config, self.seeds[0].report.progress
-        if self.seeds[0].saved is None:
+        """To the last env step, or to the return that ends the run, and the final evaluation behind it.
+
+        Returns:
+            Whether it got there; False where it was told to stop.
+        """
+        config, first = self.config, self.seeds[0]
+        if first.saved is None:
             self.begin()
             self.start_evaluation()
         else:
             for seed in self.seeds:
-                seed.play()
-        while self.env_steps < config.steps:
-            if self.stop():
-                self.save()
-                progress.note(f"stopped after {self.env_steps} env steps; a checkpoint is written")
+                seed.evaluations.play()
+        while self.env_steps < config.steps and not first.evaluations.final:
+            if self.stopped():
                 return False
             before = self.env_steps
             self.step()
@@ -224,9 +228,39 @@ class Run:
                 self.start_evaluation()
             if save:  # last: a run that resumes from it does none of this again
                 self.save()
-            progress.update(self.env_steps)
+            first.report.progress.update(self.env_steps)
+        if config.final_games and self.agent.mode.rl and not self.play_final():
+            return False
         self.finish_evaluation()
         self.finish()
+        return True
+
+    def stopped(self) -> bool:
+        """Whether it was told to stop; then a checkpoint is written."""
+        if not self.stop():
+            return False
+        self.save()
+        note = f"stopped after {self.env_steps} env steps; a checkpoint is written"
+        self.seeds[0].report.progress.note(note)
+        return True
+
+    def play_final(self) -> bool:
+        """Has the policies of the end play the final games, from a checkpoint on; False where it was stopped.
+
+        A run that is killed meanwhile resumes from that checkpoint, and one that is extended does, too: it
+        was written before there was a final row.
+        """
+        if not self.seeds[0].evaluations.final:
+            self.finish_evaluation()
+            self.fetch()
+            for seed, state in self.each(self.state):
+                now = self.agent.acting(state), self.env_steps, self.updates, {}, FINAL
+                seed.evaluations.start(Evaluating(*now))
+            self.save()
+        playing = [seed.evaluations.games for seed in self.seeds]
+        while futures.wait(playing, timeout=0.1).not_done:
+            if self.stopped():
+                return False
         return True
 
     # A step
@@ -342,7 +376,7 @@ class Run:
         Returns:
             Whether all seeds have reached the return that ends the run.
         """
-        means = [seed.finish_evaluation(self.env_steps) for seed in self.seeds]
+        means = [seed.evaluations.finish(self.env_steps) for seed in self.seeds]
         wanted = self.config.stop_at_return
         return wanted is not None and min(means) >= wanted
 
@@ -370,5 +404,5 @@ class Run:
         for seed, params in self.each(self.agent.acting(self.state)):
             seed.save_parameters(params, self.env_steps, self.updates)
         for seed in self.seeds:  # until all have theirs, they can be resumed from the ones before
-            if seed.saved is not None and seed.saved.env_steps < self.env_steps:
-                checkpoint.slim(seed.saved)
+            for manifest in checkpoint.resumable(seed.out, self.env_steps):
+                checkpoint.slim(manifest)
