@@ -27,7 +27,7 @@ from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.modes import ENCODER_OPTIMIZERS
 from srl_jax.replay import Replay
-from srl_jax.run import actor, ending, loop, seed
+from srl_jax.run import actor, ending, evaluations, loop
 from srl_jax.run.reporting import Report
 from srl_jax.run.schedules import Schedules
 from srl_jax.types import Window
@@ -333,14 +333,14 @@ def test_a_run_that_is_told_to_stop_saves_and_says_so(tmp_path, capsys):
 
 @pytest.mark.parametrize("env_steps", [120, 132])
 def test_a_stop_waits_for_no_evaluation(tmp_path, capsys, monkeypatch, env_steps):
-    original = seed.evaluate
+    original = evaluations.evaluate
 
     def play(policy, env, *, stop, **options):  # takes as long as anybody waits for it
         while options["seed"] == actor.seed_for(0, "eval", 120) and not stop():
             time.sleep(0.01)
         return original(policy, env, stop=stop, **options)
 
-    monkeypatch.setattr(seed, "evaluate", play)
+    monkeypatch.setattr(evaluations, "evaluate", play)
     calls = itertools.count()
     result = train(tmp_path / "run", progress=True, stop=lambda: next(calls) == env_steps // 4)
     assert result.interrupted and result.env_steps == result.saved == env_steps

@@ -4,6 +4,8 @@ A second emulator is kept in step with one environment of `atari.Atari`: the sam
 of episodes, the same actions. That they are in step is checked, not believed.
 """
 
+from typing import Any
+
 import ale_py
 import numpy as np
 from ale_py import roms
@@ -29,7 +31,7 @@ class Twin:
         sticky_actions, full_actions, noop_max: the environment's.
     """
 
-    def __init__(self, game: str, *, sticky_actions: float, full_actions: bool, noop_max: int):
+    def __init__(self, game: str, *, sticky_actions: float, noop_max: int, full_actions: bool = False):
         ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
         self._ale = ale_py.ALEInterface()
         self._ale.setFloat("repeat_action_probability", sticky_actions)
@@ -120,7 +122,11 @@ class AtariWithState(Atari):
         noop_max: int = 30,
         **options,
     ):
-        shared = {"sticky_actions": sticky_actions, "full_actions": full_actions, "noop_max": noop_max}
+        shared: dict[str, Any] = {
+            "sticky_actions": sticky_actions,
+            "full_actions": full_actions,
+            "noop_max": noop_max,
+        }
         super().__init__(game, **shared, **options)
         labels = ram_labels(game)
         self.state_names, self._bytes = tuple(labels), list(labels.values())

@@ -99,8 +99,8 @@ class TensorBoard:
         from tensorboardX.summary import hparams
 
         texts = {name: x if isinstance(x, bool | int | float) else str(x) for name, x in config.items()}
-        shown = ["eval/return_mean", "final/return_mean"] if config.get("final_games") else ["eval/return_mean"]
-        for summary in hparams(texts, dict.fromkeys(shown)):
+        kinds = ("eval", "final") if config.get("final_games") else ("eval",)
+        for summary in hparams(texts, {f"{kind}/return_mean": None for kind in kinds}):
             self._events.file_writer.add_summary(summary)
 
     def picture(self, key: str, env_step: int, array: np.ndarray) -> None:

@@ -21,7 +21,7 @@ from srl_jax.types import Params
 RECORDED = 501
 """Frames of the last evaluation that are kept: of 500 env steps."""
 FINAL = "final"
-"""The kind of the evaluation that follows the last env step; those of the learning curve are of kind "eval"."""
+"""The kind of the evaluation after the last env step; those of the learning curve are of kind "eval"."""
 
 
 class Evaluating(NamedTuple):

@@ -8,8 +8,8 @@ their own and are awaited before the next row is written. So no result depends o
 
 import contextlib
 import dataclasses
-from concurrent import futures
 from collections.abc import Callable, Iterator, Sequence
+from concurrent import futures
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -254,10 +254,10 @@ class Run:
             self.finish_evaluation()
             self.fetch()
             for seed, state in self.each(self.state):
-                now = self.agent.acting(state), self.env_steps, self.updates, {}, FINAL
-                seed.evaluations.start(Evaluating(*now))
+                params = self.agent.acting(state)
+                seed.evaluations.start(Evaluating(params, self.env_steps, self.updates, {}, FINAL))
             self.save()
-        playing = [seed.evaluations.games for seed in self.seeds]
+        playing = [seed.evaluations.games for seed in self.seeds if seed.evaluations.games]
         while futures.wait(playing, timeout=0.1).not_done:
             if self.stopped():
                 return False

@@ -170,9 +170,7 @@ class Report:
                 "length_mean": np.mean(played.lengths),
                 "games": games,
             }
-        row = {f"{kind}/{name}": value for name, value in own.items()} | {
-            f"wall_{kind}_s": round(seconds, 3)
-        }
+        row = {f"{kind}/{name}": value for name, value in own.items()} | {f"wall_{kind}_s": round(seconds, 3)}
         self.eval_row(env_steps, updates, row | dict(values), kind)
         what = "final evaluation" if kind == "final" else "evaluation"
         took = f"{games} games, {seconds:.1f} s"

@@ -1,4 +1,4 @@
-"""What a checkpoint holds of the learner: the parameters that act, which others load, and the rest of its state."""
+"""What a checkpoint holds of the learner: the parameters that act, which others load, and the rest."""
 
 import contextlib
 from collections.abc import Iterator

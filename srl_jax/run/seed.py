@@ -1,10 +1,9 @@
 """What one seed of a run has on the host: environments, replay, rows, and the files that they go to."""
 
 import contextlib
-import functools
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
@@ -22,6 +21,7 @@ from srl_jax.run.evaluations import FINAL, Evaluating, Evaluations
 from srl_jax.run.reporting import Report
 from srl_jax.run.schedules import Now
 from srl_jax.types import Params, TrainState
+
 
 class Seed:
     """One seed of a run; `parts` is all of it that changes while it runs, and so what a checkpoint holds.
@@ -70,8 +70,7 @@ class Seed:
         if config.diagnostics:
             say = self.report.progress.note
             self.diagnostics = Diagnostics(config, agent.measures, agent.horizon, out, say)
-        best = functools.partial(self.save_parameters, folder="best", keep=1) if config.keep_best else _nothing
-        self.evaluations = Evaluations(config, agent, self.report, best)
+        self.evaluations = Evaluations(config, agent, self.report, self._keep_best)
         self.saved: Manifest | None = None
         self.saved_position = self.replay.next_position.copy()  # replay's, when it was written
 
@@ -183,6 +182,10 @@ class Seed:
         """Writes parameters into `encoders/`, where they stay."""
         self.save_parameters(params, env_steps, updates, folder="encoders", keep=0)
 
+    def _keep_best(self, params: Params, env_steps: int, updates: int) -> None:
+        if self.config.keep_best:
+            self.save_parameters(params, env_steps, updates, folder="best", keep=1)
+
     def save_parameters(self, params: Params, env_steps: int, updates: int, **options: Any) -> Manifest:
         """Writes a checkpoint, without options of parameters alone; see `srl_jax.files.checkpoint.save`."""
         return checkpoint.save(
@@ -220,7 +223,3 @@ class Seed:
                     self.evaluations.under_way = under_way
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         return state
-
-
-def _nothing(*_: Any) -> None:
-    """Keeps no parameters."""
