@@ -78,7 +78,10 @@ def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[
         raise ConfigError(
             f"--runs: of different games, {', '.join(games)}; --force compares them all the same"
         )
-    notes = collect.check_protocols(runs, force=force) if key.startswith("eval/") else []
+    notes = []
+    if key.startswith(("eval/", "final/")):
+        more = ("final_games",) if key.startswith("final/") else ()
+        notes = collect.check_protocols(runs, force=force, more=more)
     whys = {run.path: why for run, why in collect.left_out(runs, key)}
     arms = []
     for members in found:

@@ -37,7 +37,7 @@ from .drawing import dots, plots
 from .drawing.colours import styles
 from .reporting import score_table
 from .runs import collect, scores
-from .runs.collect import RunData, comparable, steps_and_returns
+from .runs.collect import FINAL, RunData, comparable, steps_and_returns, steps_and_values
 from .runs.json_values import limits, plain
 from .sweeping import launching, manifest, options, probe, status
 from .sweeping.plan import Arm, Planned, parse_seeds, plan
@@ -127,6 +127,10 @@ def evaluated(
             values |= {
                 of: limits(statistics.estimate(statistics.mean, {game: x})) for of, x in ends[name].items()
             }
+            final = [steps_and_values(run, FINAL)[1] for run in members[name]]
+            if all(len(x) for x in final):  # the games after the last env step
+                last = np.array([x[-1] for x in final])
+                values["final"] = limits(statistics.estimate(statistics.mean, {game: last}))
             if name != names[0] and names[0] in found:
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
             entry["arms"][name] = values

@@ -197,8 +197,13 @@ def unpack(folder: Path, root: Path) -> int:
 
 
 def _is_over(run: RunData) -> bool:
-    """Whether a run says how it ended, or has all its env steps: earlier versions wrote no ended.json."""
-    return run.ended is not None or bool(run.rows) and run.rows[-1]["env_steps"] >= run.config.steps
+    """Whether a run says how it ended, or has all its env steps: earlier versions wrote no ended.json.
+
+    These had no final games, which a run with all its env steps may still be playing.
+    """
+    if run.ended is not None or run.config.final_games:
+        return run.ended is not None
+    return bool(run.rows) and run.rows[-1]["env_steps"] >= run.config.steps
 
 
 def _name(game: str, arm: str, seed: int) -> str:

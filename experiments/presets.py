@@ -6,11 +6,14 @@ after the other: `PIECES`, or presets. The thesis is Guberina & Desta, 2022; its
 their names here.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text, join, split
+
+from .protocols import PROTOCOLS, PROTOCOLS_HELP
 
 _RECONSTRUCTION = "reconstruction:weight=1"
 _FORWARD = "forward_pixels:weight=1"
@@ -71,8 +74,9 @@ _SHORT = {
 }
 
 # Atari 100k: 100,000 decisions with one environment, as published codes have it; docs/atari100k.md has where
-# each value comes from. The evaluations are a learning curve; the published score is of 100 games at the end.
+# each value comes from, and protocols.py how it is evaluated.
 _100K = {
+    **PROTOCOLS["dopamine_100k"],
     "mode": "rl_only",
     "game": "Pong",
     "steps": 100_000,
@@ -88,9 +92,7 @@ _100K = {
     "eps_train": 0.0,
     "eps_final": 0.0,
     "eps_anneal_steps": 1,
-    "eps_eval": 0.001,
     "eval_every": 10_000,
-    "noop_max": 31,
 }
 _DER = {
     **_100K,
@@ -119,6 +121,7 @@ _OF_SPR = {
 }
 _SPR = {
     **_100K,
+    **PROTOCOLS["spr_100k"],
     **_OF_SPR,
     "encoder": "nature:end=min_max",
     "rl": "rainbow:n_step=10,noisy_std=0.5,hidden=256,priority=kl,slow=none",
@@ -272,10 +275,15 @@ def _textbook(values: dict[str, Any]) -> dict[str, Any]:
     return {**values, **own}
 
 
+def _over(own: Mapping[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    return {**values, **own}
+
+
 PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "small": _small,
     "textbook": _textbook,
-    "aug": lambda values: {**values, **_AUG},
+    "aug": functools.partial(_over, _AUG),
+    **{f"protocol/{name}": functools.partial(_over, own) for name, own in PROTOCOLS.items()},
 }
 """What may stand behind a preset and a +: functions of its settings."""
 
@@ -283,6 +291,7 @@ PIECES_HELP = {
     "small": "at the size of Catch, minutes a run",
     "textbook": "without the five choices that the thesis' presets make beside the textbook's agent",
     "aug": "with random shift of all frames",
+    **{f"protocol/{name}": text for name, text in PROTOCOLS_HELP.items()},
 }
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -239,22 +239,15 @@ class Config:
         bool, False, "all 18 actions of the joystick, instead of those that the game knows (Atari)"
     )
     noop_max: int = _value(
-        int,
-        30,
-        "a game starts with fewer random no-ops than this",
-        "emulator frames",
-        minimum=0,
-        maximum=1_000,
-    )
+        int, 30, "a game starts with fewer random no-ops than this", "emulator frames",
+        minimum=0, maximum=1_000,
+    )  # fmt: skip
     frame_size: int = _value(
-        int,
-        84,
+        int, 84,
         "height and width that frames are resized to; 0: as large as the gymnasium environment's own; Catch "
         "has 42 and 84",
-        "pixels",
-        minimum=0,
-        maximum=1_024,
-    )
+        "pixels", minimum=0, maximum=1_024,
+    )  # fmt: skip
     frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1, maximum=256)
 
     encoder_from: str = _value(str, "", "run directory or checkpoint whose encoder this run starts from")

@@ -22,7 +22,8 @@ from srl_jax.files import display, loggers
 from srl_jax.files.reading import SETTINGS, read_bytes
 from srl_jax.specs import Info
 
-from ..presets import ENCODER_PRESETS, preset_values, source_preset
+from ..presets import ENCODER_PRESETS, PIECES, preset_values, source_preset
+from ..protocols import PROTOCOLS
 from . import help
 
 # The flags count as the entry point's own, so that --help shows them.
@@ -98,6 +99,8 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
         "named settings; flags beside it override them, pieces behind + change them: thesis/joint_256+small",
         flag_values=values,
     )
+    told = "how games are played and what is reported, over --preset or --config; flags beside it override it"
+    define("protocol", Info(str, told, choices=tuple(PROTOCOLS)), None, values)
     flags.DEFINE_string(
         "config",
         None,
@@ -195,7 +198,7 @@ def say_what_is_replaced(values: flags.FlagValues) -> None:
 
 
 def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool = True) -> Config:
-    """The settings that the command line asks for: defaults, then --preset or --config, then the flags given.
+    """The settings that the command line asks for: defaults, --preset or --config, --protocol, other flags.
 
     `--rl=:key=value` and `--encoder=:key=value` change options of what the preset has, for --objective see
     `with_objectives`.
@@ -217,6 +220,10 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
         if values[info.flag or name].present
     }
     base, _ = _base(values, given.get("game"))
+    if protocol := values["protocol"].value:
+        if protocol not in PROTOCOLS:
+            raise ConfigError(f"--protocol={protocol}: {specs.choices_text(protocol, PROTOCOLS)}")
+        base = PIECES[f"protocol/{protocol}"](base)
     for name in ("objectives", "imports"):
         if name in given:
             texts = tuple(given[name])

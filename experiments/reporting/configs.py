@@ -136,12 +136,15 @@ def protocol_text(config: Config) -> str:
     """How a policy was evaluated, in a line; what a game does not have is not said of it."""
     game = envs.known(config.game)
     sticky = f"sticky actions {config.sticky_actions:g}" if config.sticky_actions else "no sticky actions"
+    finals = f"{config.final_games} after the last env step"
     noops = f"fewer than {config.noop_max} no-ops at the start" if config.noop_max > 1 else "no no-ops"
     frames = f", of {game.frames_per_step} frames each" if game.frames_per_step > 1 else ""
     parts = {
         f"{config.eval_games} full games an evaluation, every {config.eval_every:,} env steps": True,
+        finals: config.final_games > 0,
         f"epsilon {config.eps_eval:g}": True,
         sticky: "sticky_actions" in game.options,
+        "all 18 actions": config.full_actions and "full_actions" in game.options,
         noops: "noop_max" in game.options,
         f"at most {config.eval_max_steps:,} env steps a game{frames}": True,
         f"in training, a lost life ends {'the return' if config.life_loss else 'nothing'}": game.lives,

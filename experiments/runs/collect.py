@@ -21,7 +21,11 @@ from .run_data import RunData, arm_name, in_order, load_run, run_directories
 
 RETURN = "eval/return_mean"
 """The key of learning curves."""
-PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
+FINAL = "final/return_mean"
+"""The key of the games after the last env step."""
+PROTOCOL = (
+    "sticky_actions", "full_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps",
+)  # fmt: skip
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
 OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", "loggers")
@@ -198,12 +202,13 @@ def check_arms(runs: Sequence[RunData]) -> None:
                     )
 
 
-def check_protocols(runs: Sequence[RunData], *, force: bool = False) -> list[str]:
+def check_protocols(runs: Sequence[RunData], *, force: bool = False, more: Sequence[str] = ()) -> list[str]:
     """Whether returns of these runs mean the same: one protocol for each game.
 
     Args:
         runs: those without a policy's returns do not count.
         force: say what differs, and do not refuse.
+        more: fields beside `PROTOCOL` that must be the same.
 
     Returns:
         A line for each run whose protocol is not that of the game's first.
@@ -217,7 +222,7 @@ def check_protocols(runs: Sequence[RunData], *, force: bool = False) -> list[str
         if not len(steps_and_returns(run)[0]):
             continue
         reference = first.setdefault(run.game, run)
-        if differing := difference(reference.config, run.config, PROTOCOL):
+        if differing := difference(reference.config, run.config, (*PROTOCOL, *more)):
             found.append(f"{run.path}: another protocol than {reference.path}: {differing}")
     if found and not force:
         raise ConfigError(f"{found[0]}; --force compares them all the same")
@@ -249,6 +254,8 @@ def differs(
             names = ("sticky_actions", "noop_max", "eval_max_steps")
             pairs = {name.replace("_", " "): (getattr(score, name), getattr(config, name)) for name in names}
             compared = {name: pair for name, pair in pairs.items() if pair[0] is not None}
+            if config.full_actions and score.sticky_actions is not None:
+                more = ["the actions that the game knows (here all 18)"]
     else:
         if score.env_steps is not None:
             compared["env steps"] = score.env_steps, config.steps if env_steps is None else env_steps

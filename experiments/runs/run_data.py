@@ -166,12 +166,15 @@ def check_rows(rows: list[dict], name: str) -> None:
             raise ConfigError(f"{name}, line {number}: env_steps is no count")
         for key, value in row.items():
             kind = key.partition("/")[0]
-            if key in ("eval/returns", STEPS):
+            if key in ("eval/returns", "final/returns", STEPS):
                 good = isinstance(value, list) and all(map(_is_count if key == STEPS else _is_number, value))
             elif kind == "diag" and isinstance(value, list):
                 good = all(map(_is_number, value))
             else:
-                drawn = kind in ("loss", "grad_norm", "diag") or key == "eval/return_mean"
+                drawn = kind in ("loss", "grad_norm", "diag") or key in (
+                    "eval/return_mean",
+                    "final/return_mean",
+                )
                 good = not drawn or _is_number(value)
             if not good:
                 raise ConfigError(f"{name}, line {number}: {key} is not made of numbers of single precision")

@@ -13,7 +13,6 @@ show damage; they do not show a forgery. Reading executes nothing: msgpack, JSON
 is unpickled. The module imports no jax until parameters are read or written.
 """
 
-import contextlib
 import hashlib
 import io
 import json
@@ -190,18 +189,6 @@ def _put_in_place(temporary: Path, final: Path) -> None:
         raise
     _flush(final.parent)
     shutil.rmtree(aside, ignore_errors=True)
-
-
-def resumable(run: str | Path, before: int) -> list[Manifest]:
-    """The checkpoints of before an env step that a run can be resumed from, oldest first.
-
-    A damaged one is passed over.
-    """
-    found = []
-    for path in _all(Path(run) / "checkpoints"):
-        with contextlib.suppress(ConfigError):
-            found.append(read_manifest(path))
-    return [manifest for manifest in found if NUMBERS in manifest.files and manifest.env_steps < before]
 
 
 def slim(manifest: Manifest) -> Manifest:

@@ -20,11 +20,10 @@ from srl_jax.agent import Agent, make_agent, over_seeds
 from srl_jax.config import Config
 from srl_jax.diagnostics.pictures import pictures
 from srl_jax.errors import ConfigError, Diverged, SaveError
-from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
 from srl_jax.loading import given_policy, initial_params
 from srl_jax.resets import reset, reset_key
-from srl_jax.run import ending
+from srl_jax.run import ending, saving
 from srl_jax.run.actor import make_env, yielding_threads
 from srl_jax.run.ending import Ending
 from srl_jax.run.evaluations import FINAL, Evaluating
@@ -404,5 +403,4 @@ class Run:
         for seed, params in self.each(self.agent.acting(self.state)):
             seed.save_parameters(params, self.env_steps, self.updates)
         for seed in self.seeds:  # until all have theirs, they can be resumed from the ones before
-            for manifest in checkpoint.resumable(seed.out, self.env_steps):
-                checkpoint.slim(manifest)
+            saving.slim_before(seed.out, self.env_steps)

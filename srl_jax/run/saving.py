@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -45,6 +46,19 @@ def restored(agent: Agent, manifest: Manifest) -> TrainState:
 
 def _fitting(template: Any, manifest: Manifest, name: str) -> Any:
     return checkpoint.load_into(template, checkpoint.load_tree(manifest, name), str(manifest.path))
+
+
+def slim_before(run: Path, env_steps: int) -> None:
+    """Slims a run's checkpoints of before an env step, from which nobody will resume; a damaged one stays.
+
+    Raises:
+        SaveError: one could not be written.
+    """
+    for path in sorted((run / "checkpoints").glob("[0-9]*")):
+        with contextlib.suppress(ConfigError):
+            manifest = checkpoint.read_manifest(path)
+            if checkpoint.NUMBERS in manifest.files and manifest.env_steps < env_steps:
+                checkpoint.slim(manifest)
 
 
 @contextlib.contextmanager
