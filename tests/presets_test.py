@@ -144,7 +144,7 @@ def test_what_stands_later_overrides():
         ("thesis/joint_25", "did you mean thesis/joint_256"),
         ("thesis/joint_256+smal", "did you mean small"),
         ("small", "small changes a preset; write it behind one"),
-        ("catch/joint+", "valid: small, textbook, aug"),
+        ("catch/joint+", "valid: small, textbook, aug, protocol/dopamine_100k"),
     ],
 )
 def test_a_preset_that_there_is_not_is_refused(name, told):

@@ -100,10 +100,8 @@ def learning_curve(
     notes = [f"band: worst to best of {' or '.join(map(str, counts))} games"] if counts else []
     notes += [f"dashed: the thesis, figure {figure}, {arm} (one run)"] if thesis else []
     for row in rows:
-        if row["kind"] == "final" and row.get("final/return_mean") is not None:
-            notes.append(
-                f"final: {row['final/return_mean']:.4g}, the mean of {row.get('final/games', '?')} games"
-            )
+        if (final := row.get("final/return_mean")) is not None:
+            notes.append(f"final: {final:.4g}, the mean of {row.get('final/games', '?')} games")
     line = plots.Line("this run", curve, thesis=reference)
     panel = plots.Panel(config.game, [line], (), plots.policy_levels(config))
     return plots.draw_panels([panel], path, title, "; ".join(notes))

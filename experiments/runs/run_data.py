@@ -171,10 +171,8 @@ def check_rows(rows: list[dict], name: str) -> None:
             elif kind == "diag" and isinstance(value, list):
                 good = all(map(_is_number, value))
             else:
-                drawn = kind in ("loss", "grad_norm", "diag") or key in (
-                    "eval/return_mean",
-                    "final/return_mean",
-                )
+                means = ("eval/return_mean", "final/return_mean")
+                drawn = kind in ("loss", "grad_norm", "diag") or key in means
                 good = not drawn or _is_number(value)
             if not good:
                 raise ConfigError(f"{name}, line {number}: {key} is not made of numbers of single precision")
