@@ -2,18 +2,24 @@
 
 import dataclasses
 import itertools
+import json
 import time
 
 import pytest
+from absl import flags
 
+from experiments import evaluate
+from experiments.command_line import flags as config_flags
+from srl_jax import loading
 from srl_jax.config import Config
+from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.files.resuming import all_to_resume, has_ended
 from srl_jax.run import ending, evaluations, loop
 from srl_jax.run.actor import seed_for
 from srl_jax.run.evaluations import FINAL, games
-from tests.helpers import SMALL
+from tests.helpers import SMALL, agent_of
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
@@ -70,6 +76,21 @@ def test_a_run_ends_with_the_row_of_its_final_games(whole):
     assert row["final/length_mean"] == pytest.approx(sum(lengths) / 5)
     assert ending.read(whole) == ("finished", 120, "")
     assert all(set(own) == {"params.msgpack"} for own in files(whole).values()) and len(files(whole)) == 2
+
+
+def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
+    values = flags.FlagValues()
+    evaluate.define_flags(values)
+    config_flags.parse(["evaluate", str(whole), "--final"], values, "run")
+    monkeypatch.setattr(evaluate, "FLAGS", values)
+    monkeypatch.setattr(loading, "make_agent", agent_of)
+    evaluate.main([])
+    played, row = json.loads(capsys.readouterr().out), rows(whole)[-1]
+    assert (played["returns"], played["lengths"]) == (row["final/returns"], row["final/lengths"])
+    for given, told in (("--games=3", "--games=3: given beside --final"), ("--envs=1", "--envs=1: given")):
+        config_flags.parse(["evaluate", f"--run={whole}", "--final", given], values)
+        with pytest.raises(ConfigError, match=told):
+            evaluate.main([])
 
 
 def test_nothing_else_of_a_run_depends_on_its_final_games(whole, tmp_path):

@@ -67,7 +67,7 @@ def text(about: str, values: flags.FlagValues) -> str:
         if shown:
             lines += [f"{title}:", *(line for flag in shown for line in flag), ""]
     if trains:
-        lines += ["Presets:", *_presets(), "", "Protocols:", *_protocols()]
+        lines += ["Protocols:", *_protocols(), "", "Presets:", *_presets()]
     return "\n".join(lines).rstrip()
 
 
