@@ -149,7 +149,7 @@ class Shown:
         self.done, self.fields = done, fields
 
 
-@pytest.mark.parametrize(("games", "left"), [(2, "0:00:50"), (4, "0:01:50")])
+@pytest.mark.parametrize(("games", "left"), [(2, "0:00:50 left"), (4, "0:01:50 left")])
 def test_the_time_left_is_bounded_until_games_have_ended(monkeypatch, games, left):
     # Two environments take 50 steps in 10 s; games are cut after 300, and four of them take two rounds.
     clock = iter([100.0, 110.0, 120.0, 130.0])

@@ -79,18 +79,20 @@ def test_a_run_ends_with_the_row_of_its_final_games(whole):
 
 
 def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
-    values = flags.FlagValues()
-    evaluate.define_flags(values)
-    config_flags.parse(["evaluate", str(whole), "--final"], values, "run")
-    monkeypatch.setattr(evaluate, "FLAGS", values)
+    def play(*arguments):
+        values = flags.FlagValues()
+        evaluate.define_flags(values)
+        config_flags.parse(["evaluate", str(whole), "--final", *arguments], values, "run")
+        monkeypatch.setattr(evaluate, "FLAGS", values)
+        evaluate.main([])
+
     monkeypatch.setattr(loading, "make_agent", agent_of)
-    evaluate.main([])
+    play()
     played, row = json.loads(capsys.readouterr().out), rows(whole)[-1]
     assert (played["returns"], played["lengths"]) == (row["final/returns"], row["final/lengths"])
-    for given, told in (("--games=3", "--games=3: given beside --final"), ("--envs=1", "--envs=1: given")):
-        config_flags.parse(["evaluate", f"--run={whole}", "--final", given], values)
-        with pytest.raises(ConfigError, match=told):
-            evaluate.main([])
+    for given in ("--games=3", "--envs=1", "--seed=5", "--epsilon=0.5"):
+        with pytest.raises(ConfigError, match=f"{given}: given beside --final"):
+            play(given)
 
 
 def test_nothing_else_of_a_run_depends_on_its_final_games(whole, tmp_path):
@@ -99,14 +101,14 @@ def test_nothing_else_of_a_run_depends_on_its_final_games(whole, tmp_path):
     assert files(tmp_path / "run") == files(whole)
 
 
-def during(monkeypatch, do):
-    """Has something done before the first step of final games."""
-    evaluate = evaluations.evaluate
+def during(monkeypatch, do, kind=FINAL):
+    """Has something done before the first step of the evaluation at the end of a run."""
+    evaluate, own = evaluations.evaluate, {games(CONFIG, kind, steps).seed for steps in (40, 120)}
 
-    def play(policy, env, *, games, stop, **options):
-        if games == CONFIG.final_games:
+    def play(policy, env, *, seed, stop, **options):
+        if seed in own:
             do(stop)
-        return evaluate(policy, env, games=games, stop=stop, **options)
+        return evaluate(policy, env, seed=seed, stop=stop, **options)
 
     monkeypatch.setattr(evaluations, "evaluate", play)
 
@@ -116,14 +118,15 @@ def endless(stop):
         time.sleep(0.01)
 
 
-def test_a_stop_is_obeyed_at_once_and_the_row_is_the_same_later(whole, tmp_path, monkeypatch):
+@pytest.mark.parametrize("kind", ["eval", FINAL])
+def test_a_stop_is_obeyed_at_once_and_the_row_is_the_same_later(whole, tmp_path, monkeypatch, kind):
     path, asked = tmp_path / "run", itertools.count()
     with monkeypatch.context() as patch:
-        during(patch, endless)  # would take for ever
+        during(patch, endless, kind)  # would take for ever
         result = train(path, stop=lambda: next(asked) > 35)  # 30 steps come before
     assert result.interrupted and result.env_steps == result.saved == 120
     assert ending.read(path) == ("stopped", 120, "")
-    assert kinds(path)[-1] == ("eval", 120)
+    assert kinds(path)[-1] == ("eval", 60 if kind == "eval" else 120)
     manifest = checkpoint.read_manifest(path)
     assert "run.json" in manifest.files and not has_ended(path, manifest, CONFIG)
     assert not resume(path).interrupted

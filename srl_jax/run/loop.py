@@ -207,7 +207,8 @@ class Run:
         else:
             for seed in self.seeds:
                 seed.evaluations.play()
-        while self.env_steps < config.steps and not first.evaluations.final:
+        final = first.evaluations.final  # under way already, where it is resumed
+        while self.env_steps < config.steps and not final:
             if self.stopped():
                 return False
             before = self.env_steps
@@ -228,39 +229,43 @@ class Run:
             if save:  # last: a run that resumes from it does none of this again
                 self.save()
             first.report.progress.update(self.env_steps)
-        if config.final_games and self.agent.mode.rl and not self.play_final():
+        if not (self.played() and (final or self.play_final())):
             return False
-        self.finish_evaluation()
         self.finish()
         return True
 
     def stopped(self) -> bool:
         """Whether it was told to stop; then a checkpoint is written."""
-        if not self.stop():
-            return False
-        self.save()
-        note = f"stopped after {self.env_steps} env steps; a checkpoint is written"
-        self.seeds[0].report.progress.note(note)
-        return True
-
-    def play_final(self) -> bool:
-        """Has the policies of the end play the final games, from a checkpoint on; False where it was stopped.
-
-        A run that is killed meanwhile resumes from that checkpoint, and one that is extended does, too: it
-        was written before there was a final row.
-        """
-        if not self.seeds[0].evaluations.final:
-            self.finish_evaluation()
-            self.fetch()
-            for seed, state in self.each(self.state):
-                params = self.agent.acting(state)
-                seed.evaluations.start(Evaluating(params, self.env_steps, self.updates, {}, FINAL))
+        if self.stop():
             self.save()
+            note = f"stopped after {self.env_steps} env steps; a checkpoint is written"
+            self.seeds[0].report.progress.note(note)
+            return True
+        return False
+
+    def played(self) -> bool:
+        """Waits for the evaluation under way and writes its rows; False where it was told to stop instead."""
         playing = [seed.evaluations.games for seed in self.seeds if seed.evaluations.games]
         while futures.wait(playing, timeout=0.1).not_done:
             if self.stopped():
                 return False
+        self.finish_evaluation()
         return True
+
+    def play_final(self) -> bool:
+        """Has the policies of the end play the final games, if there are any; False where it was stopped.
+
+        A checkpoint comes before. A run that is killed meanwhile resumes there, and so does one that is
+        extended, which therefore goes on without these games' rows.
+        """
+        if not (self.config.final_games and self.agent.mode.rl):
+            return True
+        self.fetch()
+        for seed, state in self.each(self.state):
+            params = self.agent.acting(state)
+            seed.evaluations.start(Evaluating(params, self.env_steps, self.updates, {}, FINAL))
+        self.save()
+        return self.played()
 
     # A step
 
