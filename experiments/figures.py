@@ -130,7 +130,8 @@ def evaluated(
             final = [steps_and_values(run, FINAL)[1] for run in members[name]]
             if all(len(x) for x in final):  # the games after the last env step
                 last = np.array([x[-1] for x in final])
-                values["final"] = limits(statistics.estimate(statistics.mean, {game: last}))
+                interval = limits(statistics.estimate(statistics.mean, {game: last}))
+                values["final"] = interval | {"games": members[name][0].config.final_games}
             if name != names[0] and names[0] in found:
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
             entry["arms"][name] = values
