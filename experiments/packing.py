@@ -163,11 +163,11 @@ def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
     here = read(folder) if is_packed(folder) else []
-    whole = added([], (run for run in found if _is_over(run)))
+    whole = added([], (run for run in found if run.over))
     runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
-    return len(runs) - len(here), len(runs), [run.path for run in found if not _is_over(run)]
+    return len(runs) - len(here), len(runs), [run.path for run in found if not run.over]
 
 
 def unpack(folder: Path, root: Path) -> int:
@@ -194,16 +194,6 @@ def unpack(folder: Path, root: Path) -> int:
         if run.ended is not None:
             ending.write(path, run.ended)
     return len(runs)
-
-
-def _is_over(run: RunData) -> bool:
-    """Whether a run says how it ended, or has all its env steps: earlier versions wrote no ended.json.
-
-    These had no final games, which a run with all its env steps may still be playing.
-    """
-    if run.ended is not None or run.config.final_games:
-        return run.ended is not None
-    return bool(run.rows) and run.rows[-1]["env_steps"] >= run.config.steps
 
 
 def _name(game: str, arm: str, seed: int) -> str:

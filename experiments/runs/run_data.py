@@ -48,6 +48,16 @@ class RunData(NamedTuple):
         """Whether it ended with an error, and is not under way."""
         return self.ended is not None and self.ended.failed
 
+    @property
+    def over(self) -> bool:
+        """Whether it says how it ended, or has all its env steps: earlier versions wrote no ended.json.
+
+        These had no final games, which a run with all its env steps may still be playing.
+        """
+        if self.ended is not None or self.config.final_games:
+            return self.ended is not None
+        return bool(self.rows) and self.rows[-1]["env_steps"] >= self.config.steps
+
 
 def in_order(runs: Iterable[RunData]) -> list[RunData]:
     """Runs by game, arm and seed."""
