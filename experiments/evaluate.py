@@ -82,7 +82,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
 
     loaded = loading.load(FLAGS.run, imports=FLAGS["import"].value)
     manifest, seed = loaded.manifest, FLAGS.seed
-    games, at_once, key = FLAGS.games, FLAGS.envs or config.num_envs, jax.random.key(seed)
+    games, at_once, key = FLAGS.games, FLAGS.envs or config.eval_envs or config.num_envs, jax.random.key(seed)
     if FLAGS.final:
         games, at_once, seed, key = evaluations.games(config, evaluations.FINAL, manifest.env_steps)
     policy = loaded.policy(key)
@@ -123,7 +123,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", flag_values=values)
     games = Info(int, "full games to play", minimum=1, maximum=1_000_000)
     config_flags.define("games", games, 10, values)
-    envs = Info(int, "environments that play at once; 0: the run's num_envs", "environments", minimum=0)
+    envs = Info(int, "environments that play at once; 0: the run's eval_envs", "environments", minimum=0)
     config_flags.define("envs", envs, 0, values)
     flags.DEFINE_boolean("final", False, "play the run's own final games, again", flag_values=values)
     seed = Info(int, "of the games; the same seed gives the same games", minimum=0)

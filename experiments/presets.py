@@ -93,6 +93,7 @@ _100K = {
     "eps_final": 0.0,
     "eps_anneal_steps": 1,
     "eval_every": 10_000,
+    "eval_envs": 32,
 }
 _DER = {
     **_100K,

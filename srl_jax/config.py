@@ -198,9 +198,9 @@ class Config:
         int, 0, "full games after the last env step, in a row of kind final; 0: none", "games",
         minimum=0, maximum=1_000_000,
     )  # fmt: skip
-    final_envs: int = _value(
-        int, 32, "environments that play the final games at once, one game or more each", "environments",
-        minimum=1, maximum=10_000,
+    eval_envs: int = _value(
+        int, 0, "environments that play an evaluation's games at once, one game or more each; 0: --num_envs",
+        "environments", minimum=0, maximum=10_000,
     )  # fmt: skip
     stop_at_return: float | None = _value(
         float, None, "mean evaluation return at which the run ends early, or off", "unclipped score",

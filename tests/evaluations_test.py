@@ -23,7 +23,7 @@ from tests.helpers import SMALL, agent_of
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
-CONFIG = Config(**SMALL | {"steps": 120, "eval_every": 60, "eval_games": 2}, final_games=5, final_envs=3)
+CONFIG = Config(**SMALL | {"steps": 120, "eval_every": 60, "eval_games": 2}, final_games=5, eval_envs=3)
 
 
 def train(path, config=CONFIG, **options):
@@ -61,7 +61,7 @@ def whole(tmp_path_factory, shared_agents):
 def test_the_games_are_a_function_of_the_seed_the_kind_and_the_moment():
     final, curve = games(CONFIG, FINAL, 120), games(CONFIG, "eval", 120)
     assert final[:3] == (5, 3, seed_for(0, "final", 120)) and curve[:3] == (2, 2, seed_for(0, "eval", 120))
-    assert games(dataclasses.replace(CONFIG, final_envs=9), FINAL, 120).at_once == 5
+    assert games(dataclasses.replace(CONFIG, eval_envs=9), FINAL, 120).at_once == 5
 
 
 def test_a_run_ends_with_the_row_of_its_final_games(whole):

@@ -61,7 +61,7 @@ jit = partial(jax.jit, compiler_options=_compiler_options())
 
 HOST_ONLY = (
     "game", "seed", "steps", "buffer_size", "updates_per_step", "learn_start", "gamma", "lr_final_share",
-    "beta", "beta_final", "eval_every", "eval_games", "eval_max_steps", "final_games", "final_envs",
+    "beta", "beta_final", "eval_every", "eval_games", "eval_max_steps", "final_games", "eval_envs",
     "stop_at_return", "log_every",
     "checkpoint_every", "keep_encoder_every", "keep_best", "keep_replay", "diagnostics", "diagnostics_kept",
     "loggers", "encoder_from", "heads_from", "policy_from", "pretrain_epsilon",

@@ -25,7 +25,7 @@ GROUPS: dict[str, str] = {
     "Replay": "buffer_size batch_size updates_per_step learn_start beta beta_final beta_anneal_steps",
     "Optimisation": "lr_rl lr_srl lr_encoder lr_encoder_srl lr_final_share decoder_weight_decay "
     "weight_decay max_grad_norm adam_eps",
-    "Evaluation": "eval_every eval_games eval_max_steps eps_eval final_games final_envs stop_at_return "
+    "Evaluation": "eval_every eval_games eval_max_steps eps_eval final_games eval_envs stop_at_return "
     "diagnostics diagnostics_kept",
     "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every keep_best keep_replay "
     "logger print_config dry_run tune_runtime",

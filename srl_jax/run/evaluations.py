@@ -65,9 +65,8 @@ def games(config: Config, kind: str, env_steps: int) -> Games:
         kind: "eval" or `FINAL`.
         env_steps: after which the policy is evaluated.
     """
-    number, at_once = config.eval_games, config.num_envs
-    if kind == FINAL:
-        number, at_once = config.final_games, config.final_envs
+    number = config.final_games if kind == FINAL else config.eval_games
+    at_once = config.eval_envs or config.num_envs
     seed, key = seed_for(config.seed, kind, env_steps), named_key(jax.random.key(config.seed), kind)
     return Games(number, min(number, at_once), seed, key)
 
