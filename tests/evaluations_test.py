@@ -101,9 +101,9 @@ def test_nothing_else_of_a_run_depends_on_its_final_games(whole, tmp_path):
     assert files(tmp_path / "run") == files(whole)
 
 
-def during(monkeypatch, do, kind=FINAL):
-    """Has something done before the first step of the evaluation at the end of a run."""
-    evaluate, own = evaluations.evaluate, {games(CONFIG, kind, steps).seed for steps in (40, 120)}
+def during(monkeypatch, do, kind=FINAL, moments=(40, 120)):
+    """Has something done before the first step of the evaluation of a moment, at the end of a run."""
+    evaluate, own = evaluations.evaluate, {games(CONFIG, kind, steps).seed for steps in moments}
 
     def play(policy, env, *, seed, stop, **options):
         if seed in own:
@@ -132,6 +132,16 @@ def test_a_stop_is_obeyed_at_once_and_the_row_is_the_same_later(whole, tmp_path,
     assert not resume(path).interrupted
     assert rows(path) == rows(whole) and files(path) == files(whole)
     assert has_ended(path, checkpoint.read_manifest(path), CONFIG)
+
+
+def test_a_stop_is_obeyed_while_a_row_waits_for_an_evaluation(whole, tmp_path, monkeypatch):
+    path, asked = tmp_path / "run", itertools.count()
+    with monkeypatch.context() as patch:
+        during(patch, endless, "eval", [60])
+        result = train(path, stop=lambda: next(asked) > 25)
+    assert result.interrupted and result.env_steps == result.saved == 76  # a row is due after 80
+    assert not resume(path).interrupted
+    assert rows(path) == rows(whole)
 
 
 def test_a_run_that_is_killed_meanwhile_plays_them_again(whole, tmp_path, monkeypatch):

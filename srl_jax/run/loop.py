@@ -211,12 +211,13 @@ class Run:
         while self.env_steps < config.steps and not final:
             if self.stopped():
                 return False
-            before = self.env_steps
-            self.step()
             log, evaluate, save = (
-                passed(before, self.env_steps, every)
+                passed(self.env_steps, self.env_steps + config.num_envs, every)
                 for every in (config.log_every, config.eval_every, self.checkpoint_every)
             )
+            if (log or evaluate) and not self.played():  # its rows come before the next ones
+                return False
+            self.step()
             if (log or evaluate) and self.finish_evaluation():
                 break
             if log:
@@ -229,8 +230,14 @@ class Run:
             if save:  # last: a run that resumes from it does none of this again
                 self.save()
             first.report.progress.update(self.env_steps)
-        if not (self.played() and (final or self.play_final())):
+        if not self.played():
             return False
+        self.finish_evaluation()
+        if not final:
+            self.start_final()
+            if not self.played():
+                return False
+            self.finish_evaluation()
         self.finish()
         return True
 
@@ -244,28 +251,25 @@ class Run:
         return False
 
     def played(self) -> bool:
-        """Waits for the evaluation under way and writes its rows; False where it was told to stop instead."""
+        """Waits for the games of the evaluation under way; False where it was told to stop instead."""
         playing = [seed.evaluations.games for seed in self.seeds if seed.evaluations.games]
         while futures.wait(playing, timeout=0.1).not_done:
             if self.stopped():
                 return False
-        self.finish_evaluation()
         return True
 
-    def play_final(self) -> bool:
-        """Has the policies of the end play the final games, if there are any; False where it was stopped.
+    def start_final(self) -> None:
+        """Has the policies of the end play the final games, if there are any.
 
-        A checkpoint comes before. A run that is killed meanwhile resumes there, and so does one that is
+        A checkpoint comes behind. A run that is killed meanwhile resumes there, and so does one that is
         extended, which therefore goes on without these games' rows.
         """
-        if not (self.config.final_games and self.agent.mode.rl):
-            return True
-        self.fetch()
-        for seed, state in self.each(self.state):
-            params = self.agent.acting(state)
-            seed.evaluations.start(Evaluating(params, self.env_steps, self.updates, {}, FINAL))
-        self.save()
-        return self.played()
+        if self.config.final_games and self.agent.mode.rl:
+            self.fetch()
+            for seed, state in self.each(self.state):
+                params = self.agent.acting(state)
+                seed.evaluations.start(Evaluating(params, self.env_steps, self.updates, {}, FINAL))
+            self.save()
 
     # A step
 
