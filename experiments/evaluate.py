@@ -16,7 +16,7 @@ from srl_jax.files import display
 from srl_jax.specs import Info
 
 from .command_line import flags as config_flags
-from .command_line import runtime
+from .command_line import paths, runtime
 
 FLAGS = flags.FLAGS
 
@@ -31,7 +31,7 @@ def check_gif(path: str) -> None:
 
     if not plots.available():
         raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
-    config_flags.check_file("gif", path, ".gif")
+    paths.check_file("gif", path, ".gif")
 
 
 def check_final(config: Config) -> None:

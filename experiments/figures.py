@@ -33,6 +33,7 @@ from srl_jax.specs import choices_text
 from . import packing
 from .arms import FIGURES, SCORES, Figure, figures_named
 from .command_line import flags as config_flags
+from .command_line import paths
 from .drawing import dots, plots
 from .drawing.colours import styles
 from .reporting import score_table
@@ -279,7 +280,7 @@ def run(values: flags.FlagValues) -> int:
         raise ConfigError(f"--presets: only --figure={SCORES} takes it; a JSON file names arms of your own")
     figures = figures_named(values["figure"].value, matching(values["presets"].value) if of_scores else ())
     out = values["out"].value
-    root = config_flags.check_place("out", out)
+    root = paths.check_place("out", out)
     if packing.is_packed(root) and not values["redraw"].value:
         raise ConfigError(
             f"--out={out}: its runs are packed; draw them with --redraw, or name another directory"

@@ -28,6 +28,7 @@ from srl_jax.run import ending
 from srl_jax.run.ending import Ending
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .runs.run_data import RunData, check_rows, in_order, load_run, run_directories, runs_below
 
 FLAGS = flags.FLAGS
@@ -271,7 +272,7 @@ def main(argv: list[str]) -> None:
     for name in ("runs", "out"):
         if not FLAGS[name].value:
             raise ConfigError(f"--{name}: missing; name a directory")
-    runs, out = Path(os.path.expanduser(FLAGS.runs)), config_flags.check_place("out", FLAGS.out)
+    runs, out = Path(os.path.expanduser(FLAGS.runs)), paths.check_place("out", FLAGS.out)
     if not runs.is_dir():
         raise ConfigError(f"--runs={FLAGS.runs}: no such directory")
     try:

@@ -88,10 +88,8 @@ _100K = {
     "lr_rl": 1e-4,
     "lr_srl": 1e-4,
     "adam_eps": 1.5e-4,
-    "beta_anneal_steps": 100_000,
     "eps_train": 0.0,
     "eps_final": 0.0,
-    "eps_anneal_steps": 1,
     "eval_every": 10_000,
     "eval_envs": 32,
 }
@@ -100,13 +98,15 @@ _DER = {
     "encoder": "der",
     "rl": "rainbow:n_step=20,noisy_std=0.1,hidden=256",
     "max_grad_norm": 10.0,
+    "beta_anneal_steps": 100_000,
     "slow_update_every": 2_000,
 }
 _VIEW = {"rl_view": "shift+intensity", "srl_view": "shift+intensity"}
 _JOINT_100K = {"mode": "joint", "encoder_optimizer": "summed"}
 _DOPAMINE = {**_100K, "encoder": "nature:padding=same,init=xavier", "beta": 0.5, "beta_final": 0.5}
 _DRQ = {
-    **_DOPAMINE,
+    **_100K,
+    "encoder": _DOPAMINE["encoder"],
     "rl": "drq:n_step=10,shared_hidden=true,slow=none,copies=1,target_copies=1,view=shift+intensity",
     "eps_train": 1.0,
     "eps_final": 0.1,
@@ -128,6 +128,7 @@ _SPR = {
     "rl": "rainbow:n_step=10,noisy_std=0.5,hidden=256,priority=kl,slow=none",
     "eps_train": 1.0,
     "eps_anneal_steps": 2_000,
+    "beta_anneal_steps": 100_000,
     "max_grad_norm": 10.0,
 }
 _SPR_JAX = {
@@ -187,7 +188,7 @@ _ATARI100K: dict[str, dict[str, Any]] = {
         "shrink": 0.5,
     },
     "a_lix": {
-        **_DER,
+        **{name: value for name, value in _DER.items() if name != "slow_update_every"},
         "encoder": "a_lix:lix=1",
         "rl": "rainbow:n_step=3,noisy_std=0.1,hidden=256,slow=none",
         "updates_per_step": 2,

@@ -31,6 +31,7 @@ from srl_jax.files.display import Progress
 from srl_jax.specs import Info, choices_text, value_text
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .command_line.stopping import signals
 from .train import check_extras
 
@@ -206,7 +207,7 @@ def run(values: flags.FlagValues) -> int:
 
 
 def _check_out(text: str) -> Path:
-    config_flags.check_name("out", text)
+    paths.check_name("out", text)
     path = Path(os.path.expanduser(text))
     if path.suffix.lower() != ".csv":
         raise ConfigError(f"--out={text}: must end in .csv")

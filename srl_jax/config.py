@@ -7,11 +7,11 @@ code. An "env step" is one decision of the agent, which is four emulator frames 
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from srl_jax import annealing, envs, modes, specs
+from srl_jax import annealing, checks, envs, modes, specs
 from srl_jax.errors import ConfigError
 from srl_jax.files import provenance
 from srl_jax.files.reading import parse_json, read_json, replace_text
@@ -379,32 +379,45 @@ def resolve(
     rl_registry: Mapping[str, Callable],
     encoder_registry: Mapping[str, Callable],
     objective_registry: Mapping[str, Callable],
+    given: Collection[str] = (),
 ) -> Config:
     """Writes out everything that the config leaves to a default: all options, rates and intervals.
 
-    A game gets its canonical name, see `srl_jax.envs.canonical`.
+    A game gets its canonical name, see `srl_jax.envs.canonical`, and what nothing reads its default.
+
+    Args:
+        config: a run's.
+        rl_registry, encoder_registry, objective_registry: name -> factory.
+        given: fields and options that were given and have to be read.
 
     Returns:
         A Config that resolves to itself; what config.json holds.
 
     Raises:
-        ConfigError: a specification is not valid; one line that names the flag.
+        ConfigError: a specification is not valid, or nothing reads what was given; names the flag.
     """
     rl = specs.parse(config.rl, rl_registry, "rl")
     encoder = specs.parse(config.encoder, encoder_registry, "encoder")
-    objectives = [specs.parse(text, objective_registry, "objective") for text in config.objectives]
+    objectives = tuple(specs.parse(text, objective_registry, "objective") for text in config.objectives)
+    for objective in objectives:
+        if [other.name for other in objectives].count(objective.name) > 1:
+            raise ConfigError(f"--objective={objective}: {objective.name} is given twice")
+    run = checks.run_of(config, rl=rl, objectives=objectives)
+    run.refuse(given)
+    config = run.in_force()
+    rl = specs.parse(config.rl, rl_registry, "rl")  # where RL is not trained, the default
+    run = run._replace(config=config, rl=rl)
+    rl, encoder, *terms = (run.spec_in_force(spec, given) for spec in (rl, encoder, *objectives))
     if config.n_anneal:
         annealing.check_n(config.n_anneal, rl)
-    names = [objective.name for objective in objectives]
-    for objective in objectives:
-        if names.count(objective.name) > 1:
-            raise ConfigError(f"--objective={objective}: {objective.name} is given twice")
     return dataclasses.replace(
         config,
         game=envs.canonical(config.game),
         rl=rl.full,
         encoder=encoder.full,
-        objectives=tuple(objective.full for objective in objectives),
+        objectives=tuple(term.full for term in terms),
+        n_anneal=annealing.written(config.n_anneal, int),
+        gamma_anneal=annealing.written(config.gamma_anneal, float),
         lr_encoder=modes.encoder_learning_rate(config),
         lr_encoder_srl=modes.second_learning_rate(config),
         checkpoint_every=config.checkpoint_every or config.eval_every,

@@ -5,8 +5,7 @@ A mode is a row of `MODES`; the thesis' hypothesis 1 compares them.
 
 from typing import TYPE_CHECKING, NamedTuple
 
-from srl_jax import annealing, specs
-from srl_jax.errors import ConfigError
+from srl_jax import specs
 
 if TYPE_CHECKING:
     from srl_jax.config import Config
@@ -116,108 +115,3 @@ def encoder_learning_rate(config: "Config") -> float:
     if mode.rl_trains_encoder:
         return config.lr_rl
     return config.lr_srl if mode.representation_trains_encoder else 0.0
-
-
-def check(config: "Config", *, needs_encoder: bool = False, hint: str = "", complete: bool = True) -> None:
-    """Whether the settings fit the mode.
-
-    Args:
-        config: the run.
-        needs_encoder: the run must start from an encoder even where its mode may start from
-            scratch.
-        hint: how to make such an encoder; ends the error.
-        complete: False asks for no encoder: the settings are only to be looked at.
-
-    Raises:
-        ConfigError: they do not; one line that names the flag.
-    """
-    mode = MODES[config.mode]
-    needs_encoder = needs_encoder or mode.encoder_start == "checkpoint"
-    if complete and needs_encoder and not config.encoder_from:
-        hint = hint or "any run has an encoder, and --mode=pretrain trains nothing else"
-        raise ConfigError(f"--encoder_from: --mode={mode.name} needs --encoder_from=PATH; {hint}")
-    if config.encoder_from and mode.encoder_start == "scratch":
-        others = ", ".join(m.name for m in MODES.values() if m.encoder_start != "scratch")
-        raise ConfigError(
-            f"--encoder_from={config.encoder_from}: --mode={mode.name} starts from scratch; "
-            f"modes that start from an encoder: {others}"
-        )
-    if config.objectives and not mode.representation:
-        others = ", ".join(m.name for m in MODES.values() if m.representation)
-        raise ConfigError(
-            f"--objective: --mode={mode.name} runs no representation loss (--objective=none drops "
-            f"a preset's); modes that do: {others}"
-        )
-    if mode.representation and not config.objectives:
-        raise ConfigError(
-            f"--objective: --mode={mode.name} needs at least one, for example "
-            "--objective=reconstruction:weight=1"
-        )
-    if config.srl_every > 1 and not (mode.rl and mode.representation):
-        others = ", ".join(m.name for m in MODES.values() if m.rl and m.representation)
-        raise ConfigError(
-            f"--srl_every={config.srl_every}: --mode={mode.name} does not run both kinds of loss, give 1; "
-            f"modes that do: {others}"
-        )
-    if config.policy_from and mode.rl:
-        raise ConfigError(
-            f"--policy_from={config.policy_from}: only --mode=pretrain reads it; "
-            f"--mode={mode.name} acts with the policy that it learns"
-        )
-    annealing.check(config, mode)
-    if config.augment == "srl" and not mode.representation:
-        raise ConfigError(
-            f"--augment=srl: --mode={mode.name} runs no representation loss; valid here: none, all"
-        )
-    for flag, runs in (("rl_view", mode.rl), ("srl_view", mode.representation)):
-        if (view := getattr(config, flag)) and not runs:
-            raise ConfigError(f"--{flag}={view}: --mode={mode.name} has no loss that sees it; leave it out")
-    _check_gate(config, mode)
-    _check_ratios(config)
-    moves = mode.rl_trains_encoder or mode.representation_trains_encoder
-    for flag in ("lr_encoder", "lr_encoder_srl"):
-        if (rate := getattr(config, flag)) and not moves:
-            raise ConfigError(f"--{flag}={rate}: --mode={mode.name} never moves the encoder; give 0")
-    if config.lr_encoder_srl and not two_optimizers(config):
-        raise ConfigError(
-            f"--lr_encoder_srl={config.lr_encoder_srl}: with --mode={mode.name}, --gate={config.gate} and "
-            f"--encoder_optimizer={config.encoder_optimizer} the encoder has one optimizer, whose rate is "
-            "--lr_encoder; give 0"
-        )
-
-
-def _check_gate(config: "Config", mode: Mode) -> None:
-    if config.gate != "sum" and not both_train(mode):
-        raise ConfigError(
-            f"--gate={config.gate}: in --mode={mode.name} RL and representation do not both train the "
-            "encoder, so that no two gradients meet; give sum, or --mode=joint"
-        )
-    if config.gate in PROJECTING and config.encoder_optimizer == "separate":
-        raise ConfigError(
-            f"--gate={config.gate}: with --encoder_optimizer=separate the second gradient is taken after "
-            "RL's step, so that the two do not meet; give --encoder_optimizer=summed or simultaneous"
-        )
-
-
-def _check_ratios(config: "Config") -> None:
-    if not (found := ratios(config)):
-        return
-    flag = f"--objective={found[0]}"
-    if not both_train(of(config)):
-        raise ConfigError(
-            f"{flag}: a ratio is to RL's gradient on the encoder, and with --mode={config.mode} and "
-            f"--gate={config.gate} RL and representation do not both train it; give a number"
-        )
-    if not two_optimizers(config):
-        return
-    if len(found) < len(config.objectives):
-        raise ConfigError(
-            f"{flag}: with --encoder_optimizer={config.encoder_optimizer} a ratio is of the length of the "
-            "second Adam's step, which all objectives share; give all of them ratios, or "
-            "--encoder_optimizer=summed"
-        )
-    if config.lr_encoder_srl:
-        raise ConfigError(
-            f"--lr_encoder_srl={config.lr_encoder_srl}: {found[0]} says how long the second Adam's step is; "
-            "give 0"
-        )

@@ -137,5 +137,3 @@ def test_options_of_a_lix():
     )
     with pytest.raises(ValueError, match="lix must be at most 2"):
         encoders.a_lix((20, 20, 4), lix=3.0)
-    with pytest.raises(ValueError, match="nothing reads lix_goal"):
-        encoders.a_lix((20, 20, 4), lix_goal=0.5)

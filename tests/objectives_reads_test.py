@@ -171,7 +171,6 @@ def test_a_reset_of_rls_head_resets_its_copies_and_both_adams():
     [
         ({"mode": "pretrain"}, "needs an RL head that is trained beside it"),
         ({"rl": "iqn"}, "begins with a linear layer over the latent"),
-        ({"objectives": ("spr:projection=rl,hidden=64",)}, "leave hidden out"),
         ({"objectives": ("spr:projection=rk",)}, "projection: valid: own, rl"),
     ],
 )

@@ -301,7 +301,7 @@ def test_the_same_runs_give_the_same_bytes_and_the_rows_are_beside_them(runs, te
     )
     assert row["game"] == "Catch" and row["eval/return_mean"] == "5.0" and row["loss/rl"] == ""
     assert "diag/drift/cka" not in row and "env_steps" not in row
-    with pytest.raises(ConfigError, match="report.html exists; .*--overwrite"):
+    with pytest.raises(ConfigError, match="report.html: exists; .*--overwrite"):
         report.report(parsed(f"--out={out}", f"--runs={runs}"))
     out.unlink()
     with pytest.raises(ConfigError, match="report.csv exists; .*--overwrite"):

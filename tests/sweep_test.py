@@ -28,6 +28,7 @@ from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import checkpoint, rundir
 from srl_jax.run import ending
 from srl_jax.run.ending import Ending
+from srl_jax.training import completed
 
 STUB = pathlib.Path(__file__).with_name("stub_run.py")
 CONFIG = Config(game="Catch", frame_size=42, steps=500, checkpoint_every=100, num_envs=4, learn_start=40)
@@ -164,6 +165,16 @@ def test_a_run_that_kept_its_replay_is_complete_once_it_has_finished(tmp_path):
     assert states.look(tmp_path, CONFIG) == ("resumable", 500, "")
     ending.write(tmp_path, Ending("finished", 500))
     assert states.look(tmp_path, CONFIG) == ("done", 500, "")
+
+
+def test_a_run_of_before_an_option_or_with_what_nothing_reads_is_the_run_that_was_planned(tmp_path):
+    planned = completed(dataclasses.replace(CONFIG, rl="rainbow:hidden=8"))
+    old = dataclasses.replace(planned, rl="rainbow:hidden=8,n_step=3", lr_srl=0.5)
+    old.save(tmp_path)
+    complete(tmp_path, old)
+    assert states.look(tmp_path, planned) == ("done", 500, "")
+    with pytest.raises(ConfigError, match="another configuration: rl is "):
+        states.look(tmp_path, completed(dataclasses.replace(planned, rl="rainbow:hidden=9")))
 
 
 def test_another_version_of_the_code_fails_its_run_and_not_the_sweep(stubs):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from srl_jax import envs, specs
+from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
 from srl_jax.files.provenance import history
@@ -92,33 +92,19 @@ def _place(name: str) -> tuple:
 
 
 def _fields(config: Config) -> dict[str, str]:
-    """Each field as text; an option of a specification is a field of its own."""
+    """Each setting as text, an option of an objective as "objectives spr: tau"."""
     found = {}
-    for field in INFOS:
-        value = getattr(config, field)
-        if field in ("rl", "encoder", "objectives"):
-            found |= _options(field, value)
+    for field, row, option, value in collect.settings(config):
+        if row:
+            found[f"{field} {row}: {option}" if field == "objectives" else f"{field}: {option}"] = value
         elif field in ("imports", "loggers"):
             found[field] = ", ".join(Path(text).name for text in value) or "none"
         elif value and field in ("encoder_from", "policy_from"):
             # The arm that the path of a run, or of a checkpoint in it, is of.
             found[field] = collect.arm_name(Path(re.sub(r"/(checkpoints|encoders)(/.*)?$", "", value)))
-        elif field not in ("game", "seed"):
+        else:
             found[field] = value_text(value)
     return found
-
-
-def _options(field: str, value: str | Sequence[str]) -> dict[str, str]:
-    names, found = [], {}
-    for text in (value,) if isinstance(value, str) else value:
-        try:
-            name, options = specs.split(text)
-        except specs.SpecError:
-            name, options = text, {}
-        names.append(name)
-        prefix = field if isinstance(value, str) else f"{field} {name}"
-        found |= {f"{prefix}: {key}": option for key, option in options.items()}
-    return {field: " + ".join(names) or "none"} | found
 
 
 def value_text(value: Any) -> str:

@@ -5,12 +5,13 @@ run has the link's name. Runs may be packed, see `packing`. Imports no jax.
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from srl_jax import statistics
+from srl_jax import checks, specs, statistics
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.data import Published, ReferencePolicy
 from srl_jax.errors import ConfigError
@@ -30,6 +31,29 @@ PROTOCOL = (
 
 OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", "loggers")
 """Fields in which runs of one arm and game may differ."""
+
+
+def settings(config: Config) -> Iterator[tuple[str, str, str, Any]]:
+    """(field, row, option, value) of all that a configuration says, but for its game and seed.
+
+    Of --rl, --encoder and the objectives, first the names of their rows are a value, and then each option of
+    each row is one, as text. Elsewhere row and option are "".
+    """
+    for field in INFOS:
+        value = getattr(config, field)
+        if field in ("rl", "encoder", "objectives"):
+            rows = []
+            for text in (value,) if isinstance(value, str) else value:
+                try:
+                    rows.append(specs.split(text))
+                except specs.SpecError:
+                    rows.append((text, {}))
+            yield field, "", "", " + ".join(name for name, _ in rows) or "none"
+            for row, options in rows:
+                for option, text in options.items():
+                    yield field, row, option, text
+        elif field not in ("game", "seed"):
+            yield field, "", "", value
 
 
 def load_runs(*roots: str | Path) -> list[RunData]:
@@ -196,7 +220,8 @@ def check_arms(runs: Sequence[RunData]) -> None:
     for game, arms in grouped(runs).items():
         for arm, members in arms.items():
             for run in members[1:]:
-                if differing := difference(members[0].config, run.config, names):
+                one, other = (checks.run_of(x.config).in_force() for x in (members[0], run))
+                if differing := difference(one, other, names):
                     raise ConfigError(
                         f"{run.path}: of the same arm, {arm} on {game}, as {members[0].path}, but {differing}"
                     )

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.objectives.networks import DISTANCES, MLP, functions, join, one_hot
-from srl_jax.specs import check_choice, check_size
+from srl_jax.specs import check_choice, check_size, needs
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.update import ema, periodic
 
@@ -33,6 +33,7 @@ class LatentDynamics(nn.Module):
         return z + step if self.residual else step
 
 
+@needs(tau="target=slow", every="target=periodic")
 def forward_latent(
     context: Context,
     *,

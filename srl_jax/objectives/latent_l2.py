@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 
-from srl_jax.specs import check_choice
+from srl_jax.specs import check_choice, needs
 from srl_jax.types import Array, Context, Latents, Objective, Window
 from srl_jax.update import ema
 
@@ -25,6 +25,7 @@ def l2_norm(z: Array) -> jax.Array:
 NORMS = {"half_squared": half_squared_norm, "l2": l2_norm}
 
 
+@needs(tau="target=slow")
 def latent_l2(
     context: Context,
     *,

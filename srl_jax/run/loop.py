@@ -245,8 +245,6 @@ class Run:
         """Whether it was told to stop; then a checkpoint is written."""
         if self.stop():
             self.save()
-            note = f"stopped after {self.env_steps} env steps; a checkpoint is written"
-            self.seeds[0].report.progress.note(note)
             return True
         return False
 
