@@ -49,7 +49,7 @@ check: lint ## check style, types and what is tested fast (under a minute)
 	@$(VENV)/bin/python -m mypy && $(VENV)/bin/python -m pytest -q $(FAST:%=tests/%_test.py) $(ARGS)
 
 test: install ## run all tests, a file at a time in each of two processes
-	@$(VENV)/bin/python -m pytest -q -n 2 --dist loadfile $(ARGS)
+	@$(VENV)/bin/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 train: install ## train on Pong for about three minutes (two cores), into a new directory under runs/
 	@$(VENV)/bin/python -m experiments.train $(call unless,--preset=,demo) \

@@ -1,6 +1,7 @@
 """What all tests share; pytest reads it before any test module, and so before jax is imported."""
 
 import atexit
+import importlib.metadata
 import os
 import shutil
 import tempfile
@@ -8,11 +9,22 @@ import tempfile
 # The tests are written for a CPU; JAX_PLATFORMS=cuda runs them on a GPU all the same.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
-# Tests that build the same function compile it once in a session, those in subprocesses too.
-_cache = tempfile.mkdtemp(prefix="srl_jax_tests_")
-os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
-os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0.5"
-atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+# Most programs of tests run a few times only: XLA compiles them several times faster, and they run half as
+# fast. Others need `helpers.optimised`. XLA ends a process whose flags it does not know: hence the version.
+_fast = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+if importlib.metadata.version("jaxlib").startswith("0.10."):
+    os.environ.setdefault("XLA_FLAGS", _fast)
+
+# Small products in one thread: those of OpenBLAS spin while they wait for a core.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+# What one test compiles is there for all, in both processes of `make test` and in those that tests start.
+if "PYTEST_XDIST_WORKER" not in os.environ:
+    _cache = tempfile.mkdtemp(prefix="srl_jax_tests_")
+    atexit.register(shutil.rmtree, _cache, ignore_errors=True)
+    os.environ["JAX_COMPILATION_CACHE_DIR"] = _cache
+    os.environ["JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS"] = "0"
+    os.environ["JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES"] = "-1"
 
 import pytest  # noqa: E402
 from hypothesis import HealthCheck, settings  # noqa: E402

@@ -16,8 +16,8 @@ from srl_jax.files.metrics import read_metrics
 from srl_jax.replay import Replay
 from srl_jax.run import actor, ending, loop, seed
 from srl_jax.run.reporting import Report
-from tests.helpers import JOINT, SMALL
-from tests.loop_test import train, whole
+from tests.helpers import JOINT, SMALL, whole
+from tests.loop_test import train
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 

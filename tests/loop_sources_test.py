@@ -8,8 +8,8 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics
-from tests.helpers import JOINT, SMALL, identical, one_run, write_checkpoint
-from tests.loop_test import train, whole
+from tests.helpers import JOINT, SMALL, identical, one_run, whole, write_checkpoint
+from tests.loop_test import train
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 

@@ -27,7 +27,7 @@ from srl_jax.run import actor, loop
 from srl_jax.run.schedules import Schedules
 from srl_jax.types import Window
 from srl_jax.update import Hyper
-from tests.helpers import JOINT, SMALL, one_run
+from tests.helpers import JOINT, SMALL, one_run, whole
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
@@ -38,13 +38,6 @@ def train(path, progress=False, stop=None, **values):
     config = Config(**{**SMALL, **values})
     config.save(path)
     return loop.train(config, path, progress=progress, **options)
-
-
-def whole(path):
-    """The manifest of the newest checkpoint, of which every file is what it says."""
-    manifest = checkpoint.read_manifest(path)
-    checkpoint.verify(manifest)
-    return manifest
 
 
 @pytest.fixture(scope="module")
