@@ -218,16 +218,16 @@ def test_everything_is_float32_also_where_jax_may_use_64_bits(mode, encoder, alg
 
 
 @functools.cache
-def two_updates_of_the_registry(mode):
-    """Rules, and the states before, between and after, where every objective has a rule of its own.
+def two_updates_by_rules(mode):
+    """Rules, and the states before, between and after, where every loss has a rule of its own.
 
-    That is every one in joint; elsewhere an image, a slow encoder and actions stand for them.
+    An image, a slow encoder and actions stand for all objectives, whose slow copies are moved alike.
     """
     agent = make_agent(small(mode), (FRAME, FRAME, 1), NUM_ACTIONS)
     context = Context.of(agent.encoder, NUM_ACTIONS)
     terms = {n: o for n, o in agent.objectives.items() if n == RL}
     if MODES[mode].representation:
-        names = objectives.REGISTRY if mode == "joint" else ("reconstruction", "spr", "inverse")
+        names = ("reconstruction", "spr", "inverse")
         terms |= {name: objectives.REGISTRY[name](context) for name in names}
     rules = {name: periodic(2) if name == RL else ema(0.9 - 0.03 * i) for i, name in enumerate(terms)}
     terms = {name: objective._replace(slow=rules[name]) for name, objective in terms.items()}
@@ -243,8 +243,8 @@ def two_updates_of_the_registry(mode):
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_slow_copies_of_every_objective_move_by_its_rule_in_every_mode(mode):
-    rules, states = two_updates_of_the_registry(mode)
+def test_the_slow_copies_of_each_objective_move_by_its_rule_in_every_mode(mode):
+    rules, states = two_updates_by_rules(mode)
     encoder_moves = "encoder" in MOVES[mode]
     assert all(set(state.slow) == set(rules) for state in states)
     for before, after in zip(states, states[1:], strict=False):
