@@ -10,7 +10,7 @@ The thesis' six are a table here; a figure of your own is a small JSON file:
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from srl_jax.specs import choices_text, near
 
 from .command_line.flags import MOVED
 from .presets import parts
+from .sweeping.plan import arm_of
 
 
 class FigureArm(NamedTuple):
@@ -125,13 +126,29 @@ FIGURES: dict[str, Figure] = {
 }
 """The thesis' figures; the arms' names are its presets'."""
 
+SCORES = "atari100k"
+"""The figure of scores at the end of runs, game by game, beside published ones; --presets are its arms."""
 
-def figures_named(text: str) -> list[Figure]:
+
+def scores_figure(presets: Sequence[str]) -> Figure:
+    """The figure `SCORES` of these presets."""
+    arms = tuple(FigureArm(arm_of(preset).name, preset) for preset in presets)
+    question = "Do the presets score what was published of them?"
+    return Figure(SCORES, "Scores beside the published ones after 100,000 env steps", question, arms)
+
+
+def figures_named(text: str, presets: Sequence[str] = ()) -> list[Figure]:
     """The figures that --figure=TEXT asks for: "all", names of the thesis' figures with commas, or a file.
+
+    Args:
+        text: the flag's.
+        presets: the arms of `SCORES`, which is a figure of its own.
 
     Raises:
         ConfigError: there is none of that name.
     """
+    if text == SCORES:
+        return [scores_figure(presets)]
     if text == "all":
         return list(FIGURES.values())
     if text.endswith(".json"):
@@ -140,7 +157,8 @@ def figures_named(text: str) -> list[Figure]:
     for name in names:
         if name not in FIGURES:
             raise ConfigError(
-                f"--figure={text}: {choices_text(name, FIGURES)}; or all; or a file that ends in .json"
+                f"--figure={text}: {choices_text(name, FIGURES)}; or all; or {SCORES} alone; or a file that "
+                "ends in .json"
             )
     return [FIGURES[name] for name in dict.fromkeys(names)]
 

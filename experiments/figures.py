@@ -7,6 +7,11 @@ Then the figure is drawn: the mean evaluation return over seeds against env step
 thesis' own curve lies below it where there is one, and lines show what a random and a no-op policy score.
 OUT/figures gets FIGURE.png and FIGURE.json, its numbers. The runs lie in OUT/GAME/ARM/seedN, and all figures
 share them. Flags of `srl-jax train` beside these go to all runs.
+
+    python -m experiments.figures --figure=atari100k --presets=atari100k/der --games=26 --seeds=2
+
+This figure is of scores at the end of runs, game by game, beside published ones: a picture, a table as
+atari100k.md and atari100k.csv, and its numbers. --games=26, 5, 3, signed or thesis names a suite.
 """
 
 import json
@@ -19,20 +24,24 @@ from absl import flags
 
 from srl_jax import envs, statistics
 from srl_jax.config import Config
-from srl_jax.data import published, reference_policies
+from srl_jax.data import atari100k_methods, published, reference_policies
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
+from srl_jax.files.reading import replace_text
 from srl_jax.specs import choices_text
 
 from . import packing
-from .arms import FIGURES, Figure, figures_named
+from .arms import FIGURES, SCORES, Figure, figures_named
 from .command_line import flags as config_flags
-from .drawing import plots
+from .drawing import dots, plots
 from .drawing.colours import styles
-from .runs import collect
+from .reporting import score_table
+from .runs import collect, scores
 from .runs.collect import RunData, comparable, steps_and_returns
-from .sweeping import launching, manifest, options, status
+from .runs.json_values import limits, plain
+from .sweeping import launching, manifest, options, probe, status
 from .sweeping.plan import Arm, Planned, parse_seeds, plan
+from .sweeping.plan import presets as matching
 
 FLAGS = flags.FLAGS
 
@@ -116,7 +125,7 @@ def evaluated(
         for name, arm in found.items():
             values = {"seeds": [run.seed for run in members[name]]} | _curve(arm)
             values |= {
-                of: _limits(statistics.estimate(statistics.mean, {game: x})) for of, x in ends[name].items()
+                of: limits(statistics.estimate(statistics.mean, {game: x})) for of, x in ends[name].items()
             }
             if name != names[0] and names[0] in found:
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
@@ -135,7 +144,7 @@ def _curve(arm: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
     """The learning curve of an arm on a game: at its own steps, that all of its runs have."""
     grid, returns = statistics.at_equal_steps(arm)
     interval = statistics.curve_interval(returns)
-    return {"env_steps": grid.tolist(), **_limits(interval), "runs": _plain(returns)}
+    return {"env_steps": grid.tolist(), **limits(interval), "runs": plain(returns)}
 
 
 def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.ndarray]) -> dict[str, Any]:
@@ -143,10 +152,10 @@ def _against(game: str, ours: Mapping[str, np.ndarray], base: Mapping[str, np.nd
     found = {}
     for of in ours:
         difference = statistics.estimate_difference({game: ours[of]}, {game: base[of]})
-        found[of] = _limits(difference) | {"p": _plain(statistics.welch_p(ours[of], base[of]))}
+        found[of] = limits(difference) | {"p": plain(statistics.welch_p(ours[of], base[of]))}
     areas = ({game: x["area_under_curve"]} for x in (ours, base))
     better = statistics.estimate(statistics.probability_of_improvement, *areas)
-    return found | {"probability_of_improvement": _limits(better)}
+    return found | {"probability_of_improvement": limits(better)}
 
 
 def published_levels(game: str, methods: Sequence[str], config: Config, until: int) -> list[plots.Level]:
@@ -180,8 +189,8 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
         lines = []
         for arm in figure.arms:
             if (values := entry["arms"].get(arm.name)) is not None:
-                limits = (np.array(values[key], float) for key in ("mean", "low", "high"))
-                curve = plots.Curve(values["env_steps"], *limits)
+                ends = (np.array(values[key], float) for key in ("mean", "low", "high"))
+                curve = plots.Curve(values["env_steps"], *ends)
                 lines.append(plots.Line(arm.name, curve, len(values["seeds"]), arm.thesis_curve(game)))
         policies = [plots.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
         levels = [plots.Level(**level) for level in entry["published"]]
@@ -210,36 +219,33 @@ def left_out_lines(numbers: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def _limits(interval: statistics.Interval) -> dict[str, Any]:
-    point, low, high = (_plain(values) for values in interval[:3])
-    return {"mean": point, "low": low, "high": high, "kind": interval.kind}
-
-
-def _plain(values: Any) -> Any:
-    """Floats or nested lists of floats; None for what is not a number."""
-    array = np.asarray(values, float)
-    if array.ndim:
-        return [_plain(element) for element in array]
-    return float(array) if np.isfinite(array) else None
-
-
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
     options.define_flags(values)
     flags.DEFINE_string(
         "figure",
         None,
-        f"all; {', '.join(FIGURES)}, several with commas; or a JSON file, see experiments/arms.py",
+        f"all; {', '.join(FIGURES)}, several with commas; {SCORES}, scores beside published ones; or a JSON "
+        "file, see experiments/arms.py",
         flag_values=values,
     )
-    flags.DEFINE_list("games", ["Pong"], "to run each arm on; a panel each", flag_values=values)
+    flags.DEFINE_list(
+        "presets", ["atari100k/der"], f"the arms of --figure={SCORES}, may have *", flag_values=values
+    )
+    flags.DEFINE_list(
+        "games",
+        ["Pong"],
+        f"to run each arm on; {', '.join(envs.SUITES)} stand for suites of Atari games",
+        flag_values=values,
+    )
     flags.DEFINE_string("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,", flag_values=values)
     flags.DEFINE_string("out", "runs/figures", "directory of runs and figures", flag_values=values)
     flags.DEFINE_string(
         "published",
         "Human,Dopamine Rainbow",
-        "published results to draw as lines where a game has them, names with commas, as in "
-        "srl_jax/data/published.csv",
+        "published results to draw as lines where a game has them, names with ; or commas, as in "
+        f"srl_jax/data/published.csv; of --figure={SCORES} those of its presets, or names with ;, as in "
+        "srl_jax/data/atari100k_methods.csv",
         flag_values=values,
     )
     flags.DEFINE_boolean("redraw", False, "draw from the runs that are there; start none", flag_values=values)
@@ -262,8 +268,11 @@ def run(values: flags.FlagValues) -> int:
         SaveError: a file cannot be written.
     """
     if not values["figure"].value:
-        raise ConfigError(f"--figure: missing; one of all, {', '.join(FIGURES)}, or a JSON file")
-    figures = figures_named(values["figure"].value)
+        raise ConfigError(f"--figure: missing; one of all, {', '.join(FIGURES)}, {SCORES}, or a JSON file")
+    of_scores = values["figure"].value == SCORES
+    if values["presets"].present and not of_scores:
+        raise ConfigError(f"--presets: only --figure={SCORES} takes it; a JSON file names arms of your own")
+    figures = figures_named(values["figure"].value, matching(values["presets"].value) if of_scores else ())
     out = values["out"].value
     root = config_flags.check_place("out", out)
     if packing.is_packed(root) and not values["redraw"].value:
@@ -277,10 +286,18 @@ def run(values: flags.FlagValues) -> int:
     )
     runs = planned(figures, games, seeds, options.given_flags(values))
     options.say_what_is_replaced(values, runs)
-    methods = _known(values["published"].value)
+    text = values["published"].value
+    if of_scores:
+        if other := next((game for game in games if game not in envs.ATARI_57), None):
+            raise ConfigError(f"--games={other}: published scores of --figure={SCORES} are of Atari games")
+        methods = _names(text, atari100k_methods()) if values["published"].present else None
+    else:
+        methods = _names(text, (entry.method for game in envs.ATARI_57 for entry in published(game)))
     if values["dry_run"].value:
         workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
-        display.result("\n".join(status.dry_run(root, manifest.resolve(runs), workers)))
+        entries = manifest.resolve(runs)
+        measured = probe.measured(root, entries, how) if of_scores else {}
+        display.result("\n".join(status.dry_run(root, entries, workers, measured)))
         return 0
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
@@ -293,7 +310,8 @@ def run(values: flags.FlagValues) -> int:
         read = collect.load_named(root, [run.name for run in runs])
         asked = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
         for figure in figures:
-            print(write(figure, read, games, root / "figures", **asked))
+            draws = write_scores if of_scores else write
+            print(draws(figure, read, games, root / "figures", **asked))
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error
     return code
@@ -321,13 +339,57 @@ def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directo
     return draw(figure, numbers, directory / f"{figure.name}.png")
 
 
-def _known(text: str) -> list[str]:
-    methods = [name for name in text.split(",") if name]
-    known = dict.fromkeys(entry.method for game in envs.ATARI_57 for entry in published(game))
-    for name in methods:
+def write_scores(
+    figure: Figure,
+    runs: Sequence[RunData],
+    games: Sequence[str],
+    directory: Path,
+    *,
+    methods: Sequence[str] | None,
+    force: bool,
+    among: Iterable[str],
+) -> Path:
+    """Writes the scores at the end of runs beside published ones: their numbers, two tables, a picture.
+
+    Args:
+        figure: `arms.scores_figure`.
+        runs, games: see `runs.scores.evaluated`.
+        directory: for NAME.json, NAME.csv, NAME.md and NAME.png, which are replaced.
+        methods: published ones to be beside each arm; None for those of its preset.
+        force, among: see `evaluated`.
+
+    Returns:
+        The path of the picture.
+
+    Raises:
+        ConfigError: no run has a score, or see `runs.scores.evaluated`.
+    """
+    own = {arm.name: scores.beside(arm.preset) if methods is None else methods for arm in figure.arms}
+    numbers = scores.evaluated(
+        figure.name, figure.title, figure.question, runs, own, games,
+        force=force, styles=styles(list(own), among),
+    )  # fmt: skip
+    if not numbers["games"]:
+        whys = (f"; {run['game']}, {run['arm']}: {run['reason']}" for run in numbers["left_out"][:3])
+        raise ConfigError(f"no score of any arm of figure {figure.name} in {directory.parent}{''.join(whys)}")
+    directory.mkdir(exist_ok=True)
+    name = directory / figure.name
+    replace_text(name.with_suffix(".json"), json.dumps(numbers, indent=1) + "\n")
+    replace_text(name.with_suffix(".csv"), score_table.as_csv(numbers))
+    replace_text(name.with_suffix(".md"), score_table.as_markdown(numbers))
+    return dots.draw(numbers, name.with_suffix(".png"))
+
+
+def _names(text: str, known: Iterable[str]) -> list[str]:
+    """The names in --published: with ; between them they may have commas."""
+    names = [name.strip() for name in text.split(";" if ";" in text else ",") if name.strip()]
+    known = dict.fromkeys(known)
+    if text.strip() in known:
+        return [text.strip()]
+    for name in names:
         if name not in known:
             raise ConfigError(f"--published={text}: {choices_text(name, known)}")
-    return methods
+    return names
 
 
 def main(argv: list[str]) -> int:

@@ -115,7 +115,7 @@ _OF_SPR = {
     **_VIEW,
     "updates_per_step": 2,
     "learn_start": 2_000,
-    "objectives": ("spr:target=stopped,importance=true",),
+    "objectives": ("spr:projection=rl,target=stopped,importance=true",),
 }
 _SPR = {
     **_100K,
@@ -162,7 +162,7 @@ _ATARI100K: dict[str, dict[str, Any]] = {
     "sr_spr": {
         **_SPR_JAX,
         "rl": f"rainbow:noisy=false,n_step=10,shared_hidden=true,{_SLOW}",
-        "objectives": ("spr:tau=0.995,importance=true",),
+        "objectives": ("spr:projection=rl,tau=0.995,importance=true",),
         "updates_per_step": 8,
         "reset": "all",
         "reset_every": 5_000,
@@ -172,7 +172,7 @@ _ATARI100K: dict[str, dict[str, Any]] = {
         **_SPR_JAX,
         "encoder": "impala:width=4,features=0,end=min_max,init=xavier",
         "rl": f"rainbow:noisy=false,n_step=10,hidden=2048,shared_hidden=true,{_SLOW}",
-        "objectives": ("spr:tau=0.995,importance=true,hidden=2048",),
+        "objectives": ("spr:projection=rl,tau=0.995,importance=true",),
         "n_anneal": "10->3@10000",
         "gamma": 0.997,
         "gamma_anneal": "0.97->0.997@10000",
@@ -184,10 +184,39 @@ _ATARI100K: dict[str, dict[str, Any]] = {
     },
     "a_lix": {
         **_DER,
-        "encoder": "a_lix",
+        "encoder": "a_lix:lix=1",
         "rl": "rainbow:n_step=3,noisy_std=0.1,hidden=256,slow=none",
         "updates_per_step": 2,
         "adam_eps": 1.5e-5,
+    },
+    # Its own protocol: sticky actions, lives that do not matter, no no-ops.
+    "mrq": {
+        **_100K,
+        "mode": "decoupled",
+        "objectives": (
+            "forward_latent:steps=5,target=periodic,every=250",
+            "reward:weight=0.1,hidden=512",
+            "terminal:weight=0.1,hidden=512,loss=squared",
+        ),
+        "encoder": "mrq:init=xavier",
+        "rl": "dqn:n_step=3,prioritized=true,alpha=0.4",
+        "slow_update_every": 250,
+        "batch_size": 256,
+        "learn_start": 10_000,
+        "lr_rl": 3e-4,
+        "adam_eps": 1e-8,
+        "weight_decay": 1e-4,
+        "max_grad_norm": 20.0,
+        "beta": 0.0,
+        "beta_final": 0.0,
+        "rl_view": "shift@each",
+        "srl_view": "shift@each",
+        "eps_train": 1.0,
+        "eps_final": 0.05,
+        "eps_anneal_steps": 10_000,
+        "sticky_actions": 0.25,
+        "life_loss": False,
+        "noop_max": 0,
     },
 }
 

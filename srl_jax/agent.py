@@ -166,6 +166,8 @@ def components(
     encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
     context = Context.of(encoder, num_actions)
     algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
+    if modes.of(config).rl:
+        context = context._replace(rl_layer=algorithm.first_layer)
     parsed = [specs.parse(text, objectives.REGISTRY, "objective") for text in config.objectives]
     terms = {spec.name: specs.build(spec, objectives.REGISTRY, context) for spec in parsed}
     for spec in parsed:

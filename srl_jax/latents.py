@@ -1,5 +1,6 @@
 """What each loss sees of a window: views, and latents under the online and the slow encoders."""
 
+import itertools
 import zlib
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from functools import partial
@@ -36,11 +37,12 @@ def make_losses(
 
     def losses_of(params: Params, state: TrainState, window: Window):
         key = jax.random.fold_in(state.key, state.step)
+        noise = partial(named_key, key) if encoder.train else lambda name: None
         srl_seen = see_srl(window, named_key(key, "augment"))
         alike = views.rl == views.srl
         rl_seen = srl_seen if alike else see_rl(window, named_key(key, "rl_view"))
-        srl_online = encoded(encoder, params["encoder"], srl_seen)
-        rl_online = srl_online if alike else encoded(encoder, params["encoder"], rl_seen)
+        srl_online = encoded(encoder, params["encoder"], srl_seen, noise("online"))
+        rl_online = srl_online if alike else encoded(encoder, params["encoder"], rl_seen, noise("rl online"))
         target = see_target and see_target(window, named_key(key, "target_view"))
         losses, metrics = {}, {}
         for name, objective in objectives.items():
@@ -48,14 +50,17 @@ def make_losses(
             if name == RL:
                 seen, online, opens = rl_seen, rl_online, mode.rl_trains_encoder
                 if target:
-                    online = _later(online, encoded(encoder, params["encoder"], target))
+                    then = encoded(encoder, params["encoder"], target, noise("rl target"))
+                    online = _later(online, then)
+            read = objective.read(params)
             own = state.slow.get(name, {"encoder": {}, "head": None})
             lagged = own["encoder"] if jax.tree.leaves(own["encoder"]) else params["encoder"]
-            of = partial(make_latents, encoder, params["encoder"], lagged)
-            latents = Latents(online, frozen(encoded(encoder, lagged, target or seen)), of)
+            of = _of_others(encoder, params["encoder"], lagged, noise(f"others {name}"))
+            slow = encoded(encoder, lagged, target or seen, noise(f"slow {name}"))
+            latents = Latents(online, frozen(slow), of)
             losses[name], metrics[name] = objective.loss(
-                params[name],
-                own["head"],
+                objective.head(params[name], read if opens else jax.lax.stop_gradient(read)),
+                objective.head(own["head"], own.get("read", {})),
                 latents if opens else shut(latents),
                 seen.window,
                 named_key(key, name),
@@ -91,15 +96,46 @@ def _later(now: Callable[[Offsets], jax.Array], then: Callable[[Offsets], jax.Ar
     return lambda k: now(k) if isinstance(k, int) and k == 0 else then(k)
 
 
-def make_latents(encoder: Encoder, params: Params, slow: Params, window: Window) -> Latents:
-    """Latents of a window under two encoders' parameters; none with gradient under the slow ones."""
-    of = partial(make_latents, encoder, params, slow)
-    seen = Seen(window)
-    return Latents(encoded(encoder, params, seen), frozen(encoded(encoder, slow, seen)), of)
+def make_latents(
+    encoder: Encoder, params: Params, slow: Params, window: Window, key: jax.Array | None = None
+) -> Latents:
+    """Latents of a window under two encoders' parameters; none with gradient under the slow ones.
+
+    With a key they have the encoder's noise, where it has some; see `encoded`.
+    """
+    online, lagged, others = (None,) * 3 if key is None else jax.random.split(key, 3)
+    of, seen = _of_others(encoder, params, slow, others), Seen(window)
+    return Latents(encoded(encoder, params, seen, online), frozen(encoded(encoder, slow, seen, lagged)), of)
 
 
-def encoded(encoder: Encoder, params: Params, seen: Seen) -> Callable[[Offsets], jax.Array]:
-    """offset -> latents, list of offsets -> latents of each: what `Latents` says of one encoder."""
+def _of_others(
+    encoder: Encoder, params: Params, slow: Params, key: jax.Array | None
+) -> Callable[[Window], Latents]:
+    """`Latents.of`, each window with a draw of noise of its own."""
+    number = itertools.count()
+
+    def of(window: Window) -> Latents:
+        own = None if key is None else jax.random.fold_in(key, next(number))
+        return make_latents(encoder, params, slow, window, own)
+
+    return of
+
+
+def encoded(
+    encoder: Encoder, params: Params, seen: Seen, key: jax.Array | None = None
+) -> Callable[[Offsets], jax.Array]:
+    """offset -> latents, list of offsets -> latents of each: what `Latents` says of one encoder.
+
+    With a key they are those of `Encoder.train`, where there is one. What an offset's noise is does not
+    depend on what else is asked for; offsets that are not known when they are traced share theirs.
+    """
+
+    def apply(observations: jax.Array, asked: Sequence[int | Array]) -> jax.Array:
+        if key is None or encoder.train is None:
+            return encoder.apply(params, observations)
+        names = [str(offset) if isinstance(offset, int) else "array" for offset in asked]
+        return encoder.train(params, observations, named_key(key, " ".join(names)))
+
     known: dict[Hashable, tuple[jax.Array, Mapping[Hashable, int | Array]]] = {}
 
     def latent(k: Offsets) -> jax.Array:
@@ -110,7 +146,7 @@ def encoded(encoder: Encoder, params: Params, seen: Seen) -> Callable[[Offsets],
         index = several, *offsets
         if index not in known:  # the offsets are kept too, so that their ids stay their own
             stacks = [seen.observe(seen.window, offset) for offset in offsets.values()]
-            z = encoder.apply(params, jnp.concatenate(stacks) if several else stacks[0])
+            z = apply(jnp.concatenate(stacks) if several else stacks[0], list(offsets.values()))
             known[index] = z, offsets
         z, _ = known[index]
         if not several:

@@ -13,8 +13,12 @@ RL = "rl"
 """The name of the RL objective among the objectives, and of its group of parameters."""
 ENCODER = "encoder"
 """The name of the encoder's group, and of the state of the Adam that steps it."""
-ENCODER_SRL = "encoder_srl"
-"""The name of the state of the encoder's second Adam, the representation's own."""
+SECOND = "_srl"
+"""Ends the name of the state of a group's second Adam, the representation's own."""
+ENCODER_SRL = ENCODER + SECOND
+"""The name of the state of the encoder's second Adam."""
+RL_SRL = RL + SECOND
+"""The name of the state of the second Adam of RL's head, which it has where an objective reads it."""
 BETA_1, BETA_2 = 0.9, 0.999
 """Adam's decays of the means of gradients and of their squares."""
 NOT_MEASURED = -1.0

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 
 from srl_jax.latents import named_key
-from srl_jax.optim import ENCODER, ENCODER_SRL, RL
+from srl_jax.optim import ENCODER, ENCODER_SRL, RL, RL_SRL
 from srl_jax.types import Array, Params, TrainState
 
 TRANSITION = "transition"
@@ -57,7 +57,7 @@ def reset(state: TrainState, fresh: TrainState, kind: str, shrink: float) -> Tra
 
     def moments(name: str) -> Any:
         old, new = state.opt_state[name], fresh.opt_state[name]
-        group = ENCODER if name == ENCODER_SRL else name
+        group = {ENCODER_SRL: ENCODER, RL_SRL: RL}.get(name, name)
 
         def share(path: tuple[str, ...]) -> float:
             return 1.0 if kept(kind, group, path, shrink) else 0.0
@@ -69,15 +69,16 @@ def reset(state: TrainState, fresh: TrainState, kind: str, shrink: float) -> Tra
             nu=_by_share(share, old.nu, new.nu),
         )
 
+    def copies(name: str, old: Params, new: Params) -> Params:
+        own = {ENCODER: combined(ENCODER, old["encoder"], new["encoder"])}
+        own["head"] = combined(name, old["head"], new["head"])
+        if "read" in old:
+            own["read"] = {group: combined(group, x, new["read"][group]) for group, x in old["read"].items()}
+        return own
+
     return state._replace(
         params={name: combined(name, tree, fresh.params[name]) for name, tree in state.params.items()},
-        slow={
-            name: {
-                "encoder": combined(ENCODER, copies["encoder"], fresh.slow[name]["encoder"]),
-                "head": combined(name, copies["head"], fresh.slow[name]["head"]),
-            }
-            for name, copies in state.slow.items()
-        },
+        slow={name: copies(name, old, fresh.slow[name]) for name, old in state.slow.items()},
         opt_state={name: moments(name) for name in state.opt_state},
     )
 

@@ -9,6 +9,7 @@ Nothing here imports jax, so that a command line can be checked without paying f
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeAlias
 
 if TYPE_CHECKING:
@@ -70,6 +71,10 @@ class Encoder(NamedTuple):
             where there is none, or it is not known.
         steps: what `apply` computes, step by step, for a program without this one, see
             `srl_jax.encoders.files.to_npz`; None where nothing says it.
+        make_tied_decoder: () -> Decoder whose convolutions have the transposes of the encoder's kernels; None
+            where there is none.
+        train: (params, observations as of `apply`, key) -> latents as the losses of an update see them, with
+            noise of the key; None where they are those of `apply`.
     """
 
     init: Callable[[jax.Array], Params]
@@ -79,13 +84,19 @@ class Encoder(NamedTuple):
     make_decoder: MakeDecoder | None
     map_shape: tuple[int, ...] | None = None
     steps: Sequence[Mapping[str, Any]] | None = None
+    make_tied_decoder: Callable[[], Decoder] | None = None
+    train: Callable[[Params, Array, jax.Array], jax.Array] | None = None
 
 
 class Decoder(NamedTuple):
-    """A decoder, pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S * C]."""
+    """A decoder, pure functions: init(key) -> params; apply(params, [B, D + extra]) -> [B, H, W, S * C].
+
+    What it `reads` of other groups is among the params of apply, as an objective's of `Objective.reads`.
+    """
 
     init: Callable[[jax.Array], Params]
     apply: Callable[[Params, Array], jax.Array]
+    reads: Mapping[str, Callable[[Params], Params]] = MappingProxyType({})
 
 
 class MakeDecoder(Protocol):
@@ -103,6 +114,22 @@ def no_decoder(extra_inputs: int = 0) -> Decoder:
     raise ValueError("it needs a decoder, and the encoder has none")
 
 
+class Layer(NamedTuple):
+    """A layer of another group of parameters, which an objective may compute with, see `Objective.reads`.
+
+    Attributes:
+        group: that it is a part of.
+        features: its outputs.
+        part: the group's tree -> the layer's own parameters, a part of it.
+        apply: (the layer's own parameters, float32 [B, D]) -> float32 [B, features].
+    """
+
+    group: str
+    features: int
+    part: Callable[[Params], Params]
+    apply: Callable[[Params, Array], jax.Array]
+
+
 class Context(NamedTuple):
     """What a factory may know of the run that it is built for: what it stands on.
 
@@ -110,18 +137,22 @@ class Context(NamedTuple):
         features: D, the latent's size.
         num_actions: A.
         make_decoder: as of `Encoder`; raises ValueError where there is no decoder.
-        map_shape: as of `Encoder`.
+        map_shape, make_tied_decoder: as of `Encoder`.
+        rl_layer: the first layer of RL's head, where RL is trained and its head has one that reads latents.
     """
 
     features: int
     num_actions: int
     make_decoder: MakeDecoder = no_decoder
     map_shape: tuple[int, ...] | None = None
+    make_tied_decoder: Callable[[], Decoder] | None = None
+    rl_layer: Layer | None = None
 
     @classmethod
     def of(cls, encoder: Encoder, num_actions: int) -> Context:
         """The context of objectives over an encoder."""
-        return cls(encoder.features, num_actions, encoder.make_decoder or no_decoder, encoder.map_shape)
+        decoder = encoder.make_decoder or no_decoder
+        return cls(encoder.features, num_actions, decoder, encoder.map_shape, encoder.make_tied_decoder)
 
 
 def no_other_window(window: Window) -> Latents:
@@ -171,6 +202,11 @@ class Objective(NamedTuple):
         is_decoder: the head is a decoder, which the optimizer's decoder weight decay applies to.
         image: None, or (head, latents, window) -> (target, output), float32 [B, H, W, S * C] each, for the
             picture that shows what it learnt.
+        reads: {group: its tree -> a part of it}: parameters of other groups that the loss and the image
+            compute with. Heads, slow ones too, have each part under the name of its group, beside their own
+            parameters, a dict then. Where the mode lets the objective train the encoder, its gradient flows
+            into what it reads, whose group an optimizer moves as `srl_jax.update.passes` says; elsewhere none
+            does.
     """
 
     init: Callable[[jax.Array], Params]
@@ -180,6 +216,15 @@ class Objective(NamedTuple):
     slow: Callable[[Params, Params, Array], Params] | None = None
     is_decoder: bool = False
     image: Callable[[Params, Latents, Window], tuple[Array, Array]] | None = None
+    reads: Mapping[str, Callable[[Params], Params]] = MappingProxyType({})
+
+    def read(self, params: Mapping[str, Params]) -> dict[str, Params]:
+        """{group: the part that it reads} of all parameters."""
+        return {group: part(params[group]) for group, part in self.reads.items()}
+
+    def head(self, own: Params, read: Mapping[str, Params]) -> Params:
+        """What its loss and its image are handed as a head: its own parameters and what it reads."""
+        return own | read if read else own
 
 
 class TrainState(NamedTuple):
@@ -189,7 +234,9 @@ class TrainState(NamedTuple):
         params: {"encoder": tree, OBJECTIVE: its head's tree}.
         slow: {objective: {"encoder": tree, "head": tree}}, the lagged copies of those that have some; real
             copies, never the same buffers. The encoder is {} where targets are encoded by the online one.
-        opt_state: {group: Adam's state}: "encoder", "encoder_srl" where it has two, and each head that moves.
+            "read" beside them, {group: part}, is of what the objective reads, where it does.
+        opt_state: {group: Adam's state}: "encoder", "encoder_srl" where it has two, and each head that moves;
+            "rl_srl" where an objective with an Adam of its own for the encoder reads RL's head.
         step: int32, updates done.
         key: the run's key; update i uses fold_in(key, i), so it never changes.
         norms: running means of norms, see `srl_jax.weights`; None where no weight is a ratio.

@@ -16,7 +16,17 @@ from srl_jax import weights
 from srl_jax.augment import UNCHANGED, Views
 from srl_jax.latents import make_losses, named_key
 from srl_jax.modes import ENCODER_OPTIMIZERS, GATES, Mode, both_train
-from srl_jax.optim import ENCODER, ENCODER_SRL, PROJECTIONS, RL, Optimizer, measured, real_copy
+from srl_jax.optim import (
+    ENCODER,
+    ENCODER_SRL,
+    PROJECTIONS,
+    RL,
+    RL_SRL,
+    SECOND,
+    Optimizer,
+    measured,
+    real_copy,
+)
 from srl_jax.types import Array, Encoder, Objective, Params, TrainState, Window
 from srl_jax.window import stack_last
 
@@ -102,14 +112,20 @@ class Pass(NamedTuple):
     at_start: bool = False
 
 
-def passes(mode: Mode, active: Collection[str], encoder_optimizer: str = "separate") -> tuple[Pass, ...]:
+def passes(
+    mode: Mode,
+    active: Collection[str] | Mapping[str, Objective],
+    encoder_optimizer: str = "separate",
+) -> tuple[Pass, ...]:
     """The passes of an update that computes these objectives in this mode, in their order.
 
     One, of the sum of all losses, unless both kinds of loss train the encoder.
 
     Args:
         mode: a row of `srl_jax.modes`.
-        active: names of the objectives; RL's is "rl".
+        active: names of the objectives, RL's is "rl"; where one of them reads another group
+            (`Objective.reads`), the objectives themselves by name. A pass that lets its objectives train the
+            encoder moves what they read, too, in the second pass by a second Adam of that group's.
         encoder_optimizer: how both kinds of loss step the encoder. "separate": RL's Adam steps, then the
             representation's own Adam steps on the same batch, encoded anew by the encoder that RL's step
             left, as in the thesis' code. Adam does not see the scale of a loss, so the two steps are about as
@@ -123,20 +139,22 @@ def passes(mode: Mode, active: Collection[str], encoder_optimizer: str = "separa
     if encoder_optimizer not in ENCODER_OPTIMIZERS:
         valid = ", ".join(ENCODER_OPTIMIZERS)
         raise ValueError(f"encoder_optimizer must be one of {valid}, not {encoder_optimizer}")
-    for name in (ENCODER, ENCODER_SRL):
+    for name in (ENCODER, ENCODER_SRL, RL_SRL):
         if name in active:
-            raise ValueError(f"an objective cannot be called {name}: that is a group of the encoder's")
+            raise ValueError(f"an objective cannot be called {name}: an optimizer's state has that name")
 
-    def one(names: tuple[str, ...], moments: str) -> Pass:
-        moves = mode.rl_trains_encoder and RL in names
-        moves |= mode.representation_trains_encoder and any(name != RL for name in names)
-        groups = {name: name for name in names} | ({ENCODER: moments} if moves else {})
+    def one(names: tuple[str, ...], suffix: str = "") -> Pass:
+        shared = [ENCODER] if mode.rl_trains_encoder and RL in names else []
+        if mode.representation_trains_encoder and set(names) - {RL}:
+            shared = [ENCODER, *(_read_by(active, names) if isinstance(active, Mapping) else ())]
+        groups = {name: name for name in names}
+        groups |= {group: group + suffix for group in shared if group not in names}
         return Pass(names, groups, at_start=encoder_optimizer == "simultaneous")
 
     others = tuple(name for name in active if name != RL)
     if encoder_optimizer == "summed" or not (both_train(mode) and RL in active and others):
-        return (one(tuple(active), ENCODER),)
-    return one((RL,), ENCODER), one(others, ENCODER_SRL)
+        return (one(tuple(active)),)
+    return one((RL,)), one(others, SECOND)
 
 
 def make_init(
@@ -171,7 +189,7 @@ def make_init(
             params[ENCODER] = encoder.init(named_key(start, "encoder"))
         params |= real_copy(given)
         lagged = params[ENCODER] if target_encoder == "slow" else {}
-        slow = {n: {"encoder": lagged, "head": params[n]} for n, o in objectives.items() if o.slow}
+        slow = {n: _copied(o, n, lagged, params) for n, o in objectives.items() if o.slow}
         groups = [pair for one in plan for pair in one.groups.items()]
         return TrainState(
             params=params,
@@ -260,7 +278,10 @@ def make_update(
 
         ahead = {}
         if project:
-            ahead = {names: differentiated(names, (*names, ENCODER), state.params) for names in kinds}
+            ahead = {
+                names: differentiated(names, {*names, ENCODER, *_read_by(objectives, names)}, state.params)
+                for names in kinds
+            }
             of_rl, of_srl = (gradients for _, gradients in ahead.values())
             of_rl[ENCODER], of_srl[ENCODER] = project(of_rl[ENCODER], of_srl[ENCODER])
         params, opt_state = state.params, state.opt_state
@@ -309,12 +330,13 @@ def rate_of(moments: str) -> str:
 
 
 def _added(first: tuple, *others: tuple) -> tuple:
-    """What `jax.value_and_grad` gives of a sum, from what it gives of its parts; the encoder is in each."""
+    """What `jax.value_and_grad` gives of a sum, from what it gives of its parts."""
     (value, (losses, extra)), gradients = first
     for (more, (own, own_extra)), own_gradients in others:
-        encoder = jax.tree.map(jnp.add, gradients[ENCODER], own_gradients[ENCODER])
         value, losses, extra = value + more, losses | own, extra | own_extra
-        gradients = gradients | own_gradients | {ENCODER: encoder}
+        both = gradients.keys() & own_gradients.keys()
+        sums = {group: jax.tree.map(jnp.add, gradients[group], own_gradients[group]) for group in both}
+        gradients = gradients | own_gradients | sums
     return (value, (losses, extra)), gradients
 
 
@@ -324,6 +346,17 @@ def _length_ratio(first: tuple[Params, Params], second: tuple[Params, Params]) -
     return now / jnp.maximum(before, 1e-30)
 
 
+def _read_by(objectives: Mapping[str, Objective], names: Iterable[str]) -> list[str]:
+    """The groups that objectives of these names read, see `Objective.reads`."""
+    return [group for name in names for group in objectives[name].reads]
+
+
+def _copied(objective: Objective, name: str, encoder: Params, params: Params) -> Params:
+    """What an objective has a slow copy of, `TrainState.slow`."""
+    read = objective.read(params)
+    return {"encoder": encoder, "head": params[name]} | ({"read": read} if read else {})
+
+
 def _kinds(names: Iterable[str]) -> list[tuple[str, ...]]:
     """The names of the two kinds of loss, RL's and the objectives', each that there is, RL first."""
     rl_first = sorted(names, key=lambda name: name != RL)
@@ -331,12 +364,12 @@ def _kinds(names: Iterable[str]) -> list[tuple[str, ...]]:
 
 
 def follow(objectives: Mapping[str, Objective], params: Params, slow: Params, step: Array) -> Params:
-    """The slow copies after an update, {name: {"encoder", "head"}}, each by its objective's rule."""
+    """The slow copies after an update, as `TrainState.slow`, each by its objective's rule."""
     rules = {name: objective.slow for name, objective in objectives.items() if objective.slow}
     moved = {}
     for name, old in slow.items():
         lagged = params["encoder"] if jax.tree.leaves(old["encoder"]) else {}
-        moved[name] = rules[name]({"encoder": lagged, "head": params[name]}, old, step)
+        moved[name] = rules[name](_copied(objectives[name], name, lagged, params), old, step)
     return moved
 
 

@@ -22,6 +22,13 @@ def observation(window: Window, k: int | Array) -> jax.Array:
     return stack_last(frames)
 
 
+def only(window: Window, k: int) -> Window:
+    """The window of s_{t+k} alone, which is its offset 0: the frames of one observation, and no horizon."""
+    size = window.frames.shape[1] - window.actions.shape[1]
+    ahead = {name: getattr(window, name)[:, :0] for name in ("actions", "rewards", "discounts", "valid")}
+    return window._replace(frames=window.frames[:, k : k + size], **ahead)
+
+
 def image(window: Window, k: int) -> Array:
     """The observation at offset k as a regression target: float32 [B, H, W, S * C] in [0, 1]."""
     return to_unit(observation(window, k))

@@ -47,11 +47,13 @@ def test_presets_are_what_the_table_says(name):
     for kind in ("encoder", "rl"):
         own, options = split(getattr(config, kind))
         values |= {kind: own} | {f"{kind} {option}": text for option, text in options.items()}
+    for own, options in map(split, config.objectives):
+        values |= {f"{own} {option}": text for option, text in options.items()}
     values["objective"] = " + ".join(split(text)[0] for text in config.objectives) or "-"
     for setting, wanted in TABLE[name].items():
         if wanted != "-":
             assert same(values[setting], wanted), (setting, values[setting], wanted)
-    assert (config.steps, config.num_envs, config.noop_max, config.sticky_actions) == (100_000, 1, 31, 0.0)
+    assert (config.steps, config.num_envs, config.reward_clip) == (100_000, 1, True)
 
 
 def test_all_can_be_built_together_with_their_parts():

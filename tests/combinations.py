@@ -48,7 +48,8 @@ OPTIONS = {
     "slow_tau": (0.5,), "act_with": rl.ACTORS, "rl target": tuple(rl.N_STEP_VIEWS),
     # Encoders
     "features": (0, 16, 20), "padding": ("valid", "same"), "width": (1,), "init": tuple(INITIALISERS),
-    "gain": (4.0,), "decoder_scale": (0.1,), "end": ("default", *ENDS), "pool": POOLS,
+    "gain": (4.0,), "decoder_scale": (0.1,), "end": ("default", *ENDS), "pool": POOLS, "lix": (1.0,),
+    "lix_goal": (0.0, 0.5),
     # Objectives
     "weight": WEIGHTS, "moving": (5.0,), "noise": (0.1,), "masked": (0.3,), "patch": (6,),
     "gradient_penalty": (0.1,), "steps": (1, 2, 5), "action": ("joined", "multiplied"), "beta": (0.1,),
@@ -56,7 +57,8 @@ OPTIONS = {
     "variance": (1.0,), "covariance": (25.0,), "redundancy": (0.1,), "temporal": (0, 1, 3),
     "similarity": ("bilinear", "cosine"), "temperature": (0.1,), "variability": (0.0,), "discount": (0.5,),
     "norm": ("half_squared", "l2"), "forward_pixels target": ("observation", "difference"),
-    "forward_latent target": ("slow", "stopped", "gradient"), "spr target": ("slow", "stopped"),
+    "forward_latent target": ("slow", "periodic", "stopped", "gradient"), "spr target": ("slow", "stopped"),
+    "every": (2, 3), "projection": ("own", "rl"),
     "latent_l2 target": ("zero", "slow"), "reward loss": ("two_hot", "squared"),
     "terminal loss": ("cross_entropy", "squared"),
 }  # fmt: skip
@@ -76,6 +78,7 @@ SETTINGS = {
 NEEDED = {
     "shared_hidden": {"dueling": True}, "munchausen": {"double": False}, "target=s_t+n-1": {"n_step": 2},
     "copies=2": {"view": "shift"}, "target_copies=2": {"view": "shift"}, "init_std": {"init_std": 1.0},
+    "projection=rl": {"hidden": 512}, "lix_goal": {"lix": 1.0},
 }  # fmt: skip
 """{an option, or one of its values: what it needs beside it}; refused without."""
 

@@ -166,6 +166,15 @@ def test_save_and_load(tmp_path):
         Config.load(tmp_path / "nothing")
 
 
+@pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
+def test_the_cores_of_a_run_that_is_pinned_are_kept(monkeypatch):
+    assert provenance.made_by()["cores"] == len(os.sched_getaffinity(0))
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {3})
+    monkeypatch.setattr(os, "cpu_count", lambda: 64)
+    made = provenance.made_by()
+    assert (made["cpus"], made["cores"]) == (64, 1)
+
+
 def test_git_revision(tmp_path, monkeypatch):
     for variable in ("GIT_DIR", "GIT_WORK_TREE", "GIT_INDEX_FILE"):
         monkeypatch.delenv(variable, raising=False)

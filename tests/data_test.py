@@ -44,7 +44,9 @@ def test_published_scores_begin_with_random_and_human():
         ("Random", -20.7, None),
         ("Human", 14.6, None),
     ]
-    assert [row.method for row in published("Alien")] == ["Random", "Human"]
+    alien = published("Alien")
+    assert [row.method for row in alien[:2]] == ["Random", "Human"]
+    assert {row.env_steps for row in alien[2:]} == {100_000}
     assert published("Catch") == []
 
 

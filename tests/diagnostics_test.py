@@ -223,7 +223,7 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     config = Config(**{**SMALL, "diagnostics": True, "eval_every": 60})
     lines = []
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
-    functions = SimpleNamespace(encode=encode, decode={}, others=(), conflict=None)
+    functions = SimpleNamespace(encode=encode, decode={}, groups=("encoder",), others=(), conflict=None)
     params = {"encoder": {"w": np.float32(0.5)}}
     state = TrainState(params, {}, None, np.int32(0), None)
 
@@ -254,12 +254,13 @@ def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
     config = Config(**{**SMALL, "diagnostics": True, "eval_every": 60})
     lines = []
 
-    def decode(head, z, window):  # the errors are the decoder's number, whatever the latent
+    def decode(params, z, window):  # the errors are the decoder's number, whatever the latent
         image = np.zeros((len(z), 2, 2, 2, 1), np.float32)
-        return np.full(len(z), head["w"]), image, image
+        return np.full(len(z), params["x"]["w"]), image, image
 
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
-    functions = SimpleNamespace(encode=encode, decode={"x": decode}, others=(), conflict=None)
+    groups = "encoder", "x"
+    functions = SimpleNamespace(encode=encode, decode={"x": decode}, groups=groups, others=(), conflict=None)
     diagnostics = Diagnostics(config, functions, 1, tmp_path, lines.append)
 
     def measure(step):

@@ -36,6 +36,9 @@ from tests.helpers import STACK, count, identical, jit, random_params
         ("der", {}, 576, 54_496),
         # 1,184 + 2 * 9,248 as above.  84 -> 41 -> 39 -> 37 pixels: 37*37*32 = 43,808 numbers.
         ("a_lix", {}, 50, 1_184 + 2 * 9_248 + 43_808 * 50 + 50),
+        ("a_lix", {"lix": 1.0}, 50, 1_184 + 2 * 9_248 + 43_808 * 50 + 50 + 1),
+        # 84 -> 41 -> 20 -> 9 -> 7 pixels: 7*7*32 = 1,568 numbers, as the authors' code has written down.
+        ("mrq", {}, 512, 1_184 + 3 * 9_248 + 1_568 * 512 + 512 + 1_024),
     ],
 )
 def test_parameter_counts_and_features_at_84_pixels(name, options, features, number):
@@ -182,6 +185,7 @@ LATENTS = {
     "none": [1, 3, 2, -4, 0, 0, 0, 0],
     "relu": [1, 3, 2, 0, 0, 0, 0, 0],
     "tanh": np.tanh([1, 3, 2, -4, 0, 0, 0, 0]),
+    "elu": [1, 3, 2, np.exp(-4) - 1, 0, 0, 0, 0],
     "min_max": np.array([5, 7, 6, 0, 4, 4, 4, 4]) / 7,
     "sim_norm": np.exp([1, 3, 2, -4, 0, 0, 0, 0]) / np.sum(np.exp([1, 3, 2, -4, 0, 0, 0, 0])),
     # The mean is 0.25; the squares' is 30 / 8.
@@ -196,7 +200,10 @@ def test_ends_by_hand(end):
     params = {"Dense_0": {"kernel": np.eye(4, 8), "bias": np.zeros(8)}}
     if "layer_norm" in ENDS[end]:
         params["LayerNorm_0"] = {"scale": np.ones(8), "bias": np.zeros(8)}
-    wanted = np.tanh(LATENTS["layer_norm"]) if end == "layer_norm_tanh" else LATENTS[end]
+    normed = np.asarray(LATENTS["layer_norm"])
+    twice = {"layer_norm_tanh": np.tanh(normed)}
+    twice["layer_norm_elu"] = np.where(normed > 0, normed, np.expm1(normed))
+    wanted = twice[end] if end in twice else LATENTS[end]
     z = Ended(latent).apply({"params": params}, np.array([1.0, 3, 2, -4]).reshape(1, 1, 1, 4))
     np.testing.assert_allclose(z[0], wanted, atol=1e-5)
 
@@ -224,6 +231,7 @@ def test_the_default_end_is_the_papers_behind_a_linear_layer():
     assert last("nature", features=9) == last("a_lix") == ["dense"]
     assert last("sac_ae") == last("tiny") == ["dense", "layer_norm", "tanh"]
     assert last("sac_ae", layer_norm=False) == ["dense", "tanh"]
+    assert last("mrq") == ["dense", "layer_norm", "elu"]
     assert last("sac_ae", features=0, end="tanh") == ["tanh"]
 
 
@@ -249,7 +257,8 @@ def test_bottleneck_is_normalised_before_its_tanh(layer_norm):
 
 
 @pytest.mark.parametrize(
-    ("name", "least"), [("nature", 29), ("sac_ae", 14), ("tiny", 15), ("der", 21), ("a_lix", 10)]
+    ("name", "least"),
+    [("nature", 29), ("sac_ae", 14), ("tiny", 15), ("der", 21), ("a_lix", 10), ("mrq", 24)],
 )
 def test_frames_below_the_least_size_of_the_layers_are_refused(name, least):
     # nature needs 3 pixels for its last layer, so 5 for the one before and, with zeros below, 8 + 4 * 5 + 1.
@@ -284,8 +293,8 @@ def test_zeros_all_around_are_flaxs_same():
         assert padding_between(before, after, layer, centred=True) == expected
 
 
-# The other two leave out 1 row in 64.
-@pytest.mark.parametrize("name", sorted(encoders.REGISTRY.keys() - {"sac_ae", "a_lix"}))
+# The other three leave out 1 row in 64.
+@pytest.mark.parametrize("name", sorted(encoders.REGISTRY.keys() - {"sac_ae", "a_lix", "mrq"}))
 def test_every_pixel_of_an_odd_image_counts(name):
     shape = (64, 41, 3)
     encoder = encoders.REGISTRY[name](shape)
@@ -333,7 +342,7 @@ def test_doubling_by_hand():
 
 def test_where_a_map_is_flattened_its_shape_is_known():
     shapes = {"nature": (7, 7, 64), "sac_ae": (35, 35, 32), "tiny": (9, 9, 16), "impala": (11, 11, 32)}
-    shapes |= {"der": (3, 3, 64), "a_lix": (37, 37, 32)}
+    shapes |= {"der": (3, 3, 64), "a_lix": (37, 37, 32), "mrq": (7, 7, 32)}
     assert {n: row((84, 84, 4)).map_shape for n, row in encoders.REGISTRY.items()} == shapes
     assert encoders.nature((64, 96, 4)).map_shape == (5, 8, 64)
 

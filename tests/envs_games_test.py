@@ -111,8 +111,17 @@ def test_a_list_that_was_cut_at_commas():
     parts = "catch:ball=2,background=static,Pong,my:E-v0,grey=true,catch,Catch".split(",")
     expected = ["catch:ball=2,background=static", "Pong", envs.canonical("my:E-v0,grey=true"), "Catch"]
     assert envs.several(parts) == expected and envs.several([]) == []
+    assert envs.several(["Pong", "3"]) == ["Pong", "BattleZone", "NameThisGame", "Phoenix"]
     with pytest.raises(SpecError, match="^--games=Pang: did you mean Pong"):
         envs.several(["Pang"])
+
+
+def test_suites_are_of_atari_games_and_as_large_as_their_names_say():
+    for name, its in envs.SUITES.items():
+        assert set(its) <= set(envs.ATARI_57) and len(set(its)) == len(its)
+        assert not name.isdigit() or len(its) == int(name)
+    assert set(envs.SUITES["3"]) < set(envs.SUITES["5"])
+    assert set(envs.SUITES["signed"]) < set(envs.SUITES["26"])
 
 
 def test_directories_of_games():

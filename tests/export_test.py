@@ -93,6 +93,8 @@ def computed(steps, arrays, x):
                 x = x * own["scale"] + own["bias"]
             case "tanh":
                 x = np.tanh(x)
+            case "elu":
+                x = np.where(x > 0, x, np.expm1(x))
             case "average":
                 x = x.mean((1, 2))
             case "min_max":
@@ -109,7 +111,13 @@ def computed(steps, arrays, x):
 @pytest.mark.parametrize(
     ("spec", "side"),
     [("nature:gain=32", 84), ("sac_ae:features=5", 37), ("tiny", 45), ("tiny:features=0", 42)]
-    + [("der", 84), ("der:features=8,end=sim_norm", 41), ("der:end=min_max", 41), ("a_lix", 20)]
+    + [
+        ("der", 84),
+        ("der:features=8,end=sim_norm", 41),
+        ("der:end=min_max", 41),
+        ("a_lix", 20),
+        ("mrq:features=8", 25),
+    ]
     + [("nature:padding=same,pool=average,end=layer_norm", 42), ("tiny:end=relu", 42)],
 )
 def test_what_the_file_says_is_enough_to_run_the_encoder(tmp_path, spec, side):

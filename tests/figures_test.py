@@ -12,6 +12,7 @@ from experiments.command_line import flags as config_flags
 from experiments.drawing import plots
 from experiments.reporting.numbers import arms_of, compare, table
 from experiments.runs import collect
+from experiments.runs.json_values import plain
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
@@ -291,4 +292,4 @@ def test_policies_that_learn_nothing_are_in_the_json_and_drawn(runs, monkeypatch
 
 
 def test_limits_of_a_single_seed_are_no_numbers():
-    assert figures._plain([1.0, np.nan]) == [1.0, None]
+    assert plain([1.0, np.nan]) == [1.0, None]

@@ -177,6 +177,7 @@ def random_state(init, seed: int = 0) -> TrainState:
                 "encoder": to_numpy(params["encoder"]) if own["encoder"] else {},
                 "head": to_numpy(params[name]),
             }
+            | ({"read": fill(own["read"], seed)} if "read" in own else {})
             for name, own in shapes.slow.items()
         },
         opt_state=jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), shapes.opt_state),

@@ -69,19 +69,20 @@ def by_numpy(head, z: np.ndarray, action: np.ndarray) -> np.ndarray:
     return x @ head["out"]["kernel"] + head["out"]["bias"]
 
 
-@pytest.mark.parametrize("target", ["slow", "stopped"])
+@pytest.mark.parametrize("target", ["slow", "periodic", "stopped"])
 def test_forward_latent_against_numpy(target):
     z, slow = draw(3, BATCH, D), draw(3, BATCH, D, seed=1)
     objective = objectives.forward_latent(make_context(D), steps=2, hidden=7, residual=True, target=target)
     window = make_window(horizon=2)
     window.valid[1, 1] = 0
     losses, head, _ = loss_of(objective, latents_of(z, slow), window)
-    head, goal = head["MLP_0"], slow if target == "slow" else z
+    head, goal = head["MLP_0"], z if target == "stopped" else slow
     first = z[0] + by_numpy(head, z[0], window.actions[:, 0])
     second = first + by_numpy(head, first, window.actions[:, 1])
     errors = [((p - g) ** 2).mean(-1) for p, g in ((first, goal[1]), (second, goal[2]))]
     np.testing.assert_allclose(losses, (errors[0] + window.valid[:, 1] * errors[1]) / 2, rtol=1e-5)
-    assert (objective.slow is not None) == (target == "slow") and objective.horizon == 2
+    assert (objective.slow is None) == (target == "stopped") and objective.horizon == 2
+    assert getattr(objective.slow, "every", None) == (250 if target == "periodic" else None)
 
 
 @pytest.mark.parametrize(("target", "reaches"), [("slow", False), ("stopped", False), ("gradient", True)])
@@ -345,7 +346,7 @@ def test_latents_are_pulled_to_zero_or_to_the_slow_ones():
     [
         ("forward_latent", {"steps": 0}, "steps"),
         ("forward_latent", {"distance": "cosin"}, "did you mean cosine"),
-        ("forward_latent", {"target": "fast"}, "slow, stopped, gradient"),
+        ("forward_latent", {"target": "fast"}, "slow, periodic, stopped, gradient"),
         ("forward_latent", {"tau": 1.0}, "tau"),
         ("spr", {"target": "gradient"}, "slow, stopped"),
         ("infonce", {"temperature": 0.0}, "temperature"),

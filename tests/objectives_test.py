@@ -107,7 +107,7 @@ def test_a_decoder_that_is_not_there_is_told_in_one_line(name):
 
 def test_a_context_is_what_the_encoder_says():
     encoder = make_encoder(features=5)
-    assert Context.of(encoder, 7) == (5, 7, encoder.make_decoder, None)
+    assert Context.of(encoder, 7) == (5, 7, encoder.make_decoder, None, None, None)
     assert Context.of(encoder._replace(map_shape=(2, 3, 4)), 7).map_shape == (2, 3, 4)
 
 

@@ -116,3 +116,29 @@ def test_the_best_arm_comes_first(tmp_path):
     assert lines[3].startswith("area: mean evaluation return up to 100 env steps. The best of 2 is flattered")
     assert len(lines) == 4
     assert status.best(collect.load_runs(tmp_path / "CatchDistractor")) == []
+
+
+def test_alike_are_runs_of_the_same_work():
+    other = {
+        "updates_per_step": 1.0,
+        "batch_size": 64,
+        "encoder": "der",
+        "mode": "joint",
+        "objectives": ("spr",),
+        "game": "Pong",
+    }
+    kinds = {status.alike(dataclasses.replace(CONFIG, **{name: value})) for name, value in other.items()}
+    assert len(kinds | {status.alike(CONFIG)}) == 7
+    same = dataclasses.replace(CONFIG, game="CatchDistractor", seed=3, lr_rl=1e-3)
+    assert status.alike(same) == status.alike(CONFIG)
+
+
+def test_a_measured_speed_counts_where_nothing_here_was_timed(tmp_path):
+    write(tmp_path / "a", (1000, 10.0))
+    new = dataclasses.replace(CONFIG, encoder="tiny:features=77")
+    found = entries(a="") | entries(new, x="")
+    measured = {status.alike(CONFIG): (10, 1.0), status.alike(new): (1000, 50.0)}
+    assert rates(tmp_path, found, measured) == {"a": 100.0, "x": 20.0}
+    # x: 1000 steps at 20/s are 50 s; a, which has no checkpoint, is not timed anew: 1000 at 100/s.
+    (line,) = [line for line in status.dry_run(tmp_path / "new", entries(new, x=""), 1, measured)][-1:]
+    assert "0:00:50 with 1 at once" in line

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from srl_jax.window import image, observation, stack_last
+from srl_jax.window import image, observation, only, stack_last
 from tests.helpers import STACK, jit, make_window
 
 
@@ -12,6 +12,13 @@ def numbered(batch=2, horizon=3):
     numbers = 10 * np.arange(batch)[:, None] + np.arange(STACK + horizon)
     frames = np.broadcast_to(numbers[:, :, None, None, None], window.frames.shape)
     return window._replace(frames=frames.astype(np.uint8))
+
+
+def test_a_window_of_one_observation_has_the_frames_of_its_offset_and_no_horizon():
+    for k in (0, 2):
+        alone = only(numbered(), k)
+        np.testing.assert_array_equal(observation(alone, 0), observation(numbered(), k))
+        assert alone.frames.shape[1] == STACK and alone.actions.shape == alone.valid.shape == (2, 0)
 
 
 def test_observation_at_an_offset_by_hand():

@@ -34,6 +34,7 @@ COMMANDS: dict[str, Command] = {
     "report": Command("write a page about many runs", "runs --out=report.html"),
     "draw": Command("draw the figures of a run again", "runs/x"),
     "compare": Command("draw the curves of several runs", "runs/a runs/b --out=ab.png"),
+    "power": Command("how many seeds a difference takes", "--effect=0.1 --spread=0.12"),
     "export": Command("write a run's encoder to a file for numpy", "runs/x --encoder=enc.npz"),
 }
 """What follows `srl-jax`, in the order in which it is listed."""

@@ -44,7 +44,9 @@ where XLA's or another run's have the cores, products of 84 x 210 by 210 x 160 t
 _AT_START = MALLOC | BLAS
 """What is read when the process, or numpy, starts."""
 
-MULTIPLY_ADDS = {"der": 1.3, "tiny": 2.1, "nature": 7.8, "a_lix": 32.4, "sac_ae": 51.6, "impala": 54.7}
+MULTIPLY_ADDS = {
+    "der": 1.3, "tiny": 2.1, "nature": 7.8, "mrq": 12.8, "a_lix": 32.4, "sac_ae": 51.6, "impala": 54.7
+}  # fmt: skip
 """{encoder: millions of multiplications with an addition} that one observation of 84 x 84 x 4 takes with the
 default options, as XLA counts them (`tests/runtime_test.py`). An encoder's size decides what helps it on a
 CPU, and has to be known before jax is imported. An encoder that is not listed, a user's own, counts as the
@@ -60,7 +62,7 @@ products of `tiny` are too small: on Catch a run makes 370 env steps a second wi
 THREAD_FROM = 20.0
 """Million multiply-adds from which a thread more than there are cores pays. With it, on two cores, updates
 of `sac_ae` take 0.86 of the time in joint training and 0.95 in RL alone, those of `nature` 1.02. `impala`,
-`a_lix` and `der` have not been measured, with either: they follow from their size."""
+`a_lix`, `mrq` and `der` have not been measured, with either: they follow from their size."""
 
 
 def cache_folder(env: Mapping[str, str]) -> Path | None:

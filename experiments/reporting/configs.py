@@ -20,7 +20,7 @@ THEN = ", then "
 
 
 def about(run: RunData) -> dict[str, str]:
-    """What a run was made by: "git_revision", "cpus", "started", the versions of packages; no empty ones.
+    """What a run was made by: revision, CPUs, cores, versions of packages, "started"; no empty ones.
 
     Of a run that was resumed under other versions or elsewhere, each is there in turn: `1.2, then 1.3`.
 
@@ -31,7 +31,7 @@ def about(run: RunData) -> dict[str, str]:
         past = {name: x for name, x in history(run.about).items() if any(x)}
         texts = {name: THEN.join(str(value or "none") for value in x) for name, x in past.items()}
         # Environment variables are among these, and are nobody's business.
-        names = ["git_revision", "cpus", *(run.about.get("versions") or {})]
+        names = ["git_revision", "cpus", "cores", *(run.about.get("versions") or {})]
     except (ValueError, TypeError, KeyError, AttributeError) as error:
         raise ConfigError(f"{run.path / 'config.json'}: {error}") from None
     revision = THEN.join(re.sub(r"^(\w{10})\w*", r"\1", x) for x in texts.get("git_revision", "").split(THEN))

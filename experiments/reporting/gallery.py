@@ -124,7 +124,10 @@ def profiles(
         return []
     curves = {arm: Curve(thresholds, *interval[:3]) for arm, interval in found.items()}
     counts = {arm: sum(len(comparisons[game].returns[arm]) for game in games) for arm in found}
-    how = {"label": "share of runs above it", "across": "normalised return at the end"}
+    across = "normalised return at the end"
+    if any(interval.kind == statistics.NARROW for interval in found.values()):
+        across += f"\nbands of fewer than {statistics.ENOUGH} runs are too narrow"
+    how = {"label": "share of runs above it", "across": across}
     return _in_groups(", ".join(games), curves, counts, looks, baseline, limits=(-0.03, 1.03), **how)
 
 

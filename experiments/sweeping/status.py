@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax import envs, statistics
+from srl_jax import envs, specs, statistics
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
@@ -68,46 +68,55 @@ def progress(run: Path, tail: int = 1 << 16) -> Progress:
     return found
 
 
-def rates(root: Path, entries: Mapping[str, Entry]) -> dict[str, float | None]:
-    """{name: env steps a second} of runs: their own, else that of runs like them here, or of published ones.
+Sums = dict[tuple, tuple[float, float]]
+"""{`alike`: (env steps, seconds)} of runs."""
 
-    None where there is none of these. Alike are runs of the same kind of game, encoder and mode.
+
+def rates(
+    root: Path, entries: Mapping[str, Entry], measured: Mapping[tuple, tuple[float, float]] = {}
+) -> dict[str, float | None]:
+    """{name: env steps a second} of runs: their own, else that of runs like them.
+
+    These are here, or were measured, or have been published; None where there is none of these.
     """
     own = {name: progress(root / name) for name in entries}
-    here = _sums((entry.config, own[name]) for name, entry in entries.items())
+    here = sums((entry.config, own[name]) for name, entry in entries.items())
     found: dict[str, float | None] = {}
     for name, (_, config) in entries.items():
-        like = here.get(_kind(config)) or _published().get(_kind(config))
+        like = here.get(alike(config)) or measured.get(alike(config)) or _published().get(alike(config))
         found[name] = own[name].per_s if _timed(config, own[name]) else like and like[0] / like[1]
     return found
 
 
-def _kind(config: Config) -> tuple[str, str, str]:
-    return envs.known(config.game).kind, config.encoder, config.mode
+def alike(config: Config) -> tuple:
+    """What runs have in common that take equally long: game, network, losses, and updates for an env step."""
+    losses = tuple(specs.split(text)[0] for text in config.objectives)
+    work = config.updates_per_step, config.batch_size
+    return envs.known(config.game).kind, config.encoder, config.mode, losses, *work
 
 
 def _timed(config: Config, got: Progress) -> bool:
     return got.seconds > 0 and got.env_steps > 2 * config.learn_start
 
 
-def _sums(runs: Iterable[tuple[Config, Progress]]) -> dict[tuple, tuple[float, float]]:
-    """{`_kind`: (env steps, seconds)} of all runs of it that have learnt for a while."""
-    found: dict[tuple, tuple[float, float]] = {}
+def sums(runs: Iterable[tuple[Config, Progress]]) -> Sums:
+    """Of each kind all runs that have learnt for a while."""
+    found: Sums = {}
     for config, got in runs:
         if _timed(config, got):
-            steps, seconds = found.get(_kind(config), (0.0, 0.0))
-            found[_kind(config)] = steps + got.env_steps, seconds + got.seconds
+            steps, seconds = found.get(alike(config), (0.0, 0.0))
+            found[alike(config)] = steps + got.env_steps, seconds + got.seconds
     return found
 
 
 @functools.cache
-def _published() -> dict[tuple, tuple[float, float]]:
-    """`_sums` of the runs that the project has published."""
+def _published() -> Sums:
+    """`sums` of the runs that the project has published."""
     runs: list[RunData] = []
     for folder in packing.folders_below(RESULTS):
         with contextlib.suppress(ConfigError):  # of an earlier version
             runs += packing.read(folder, only_last=True)
-    return _sums((run.config, Progress(run.rows[-1]["env_steps"], run.rows[-1]["wall_s"])) for run in runs)
+    return sums((run.config, Progress(run.rows[-1]["env_steps"], run.rows[-1]["wall_s"])) for run in runs)
 
 
 def seconds_left(
@@ -221,13 +230,23 @@ def ended_text(run: Path) -> str:
     return f"{steps:,} env steps in {hms(got.seconds)}{score}"
 
 
-def dry_run(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
+def dry_run(
+    root: Path,
+    entries: Mapping[str, Entry],
+    workers: int,
+    measured: Mapping[tuple, tuple[float, float]] = {},
+) -> list[str]:
     """What `launching.run_sweep` would do, as lines; writes nothing.
+
+    Args:
+        root, entries: see `states.look_at_all`.
+        workers: runs at once.
+        measured: see `rates`.
 
     Raises:
         ConfigError: see `states.look_at_all`.
     """
-    found, per_s = states.look_at_all(root, entries), rates(root, entries)
+    found, per_s = states.look_at_all(root, entries), rates(root, entries, measured)
     # What a run has beyond its last checkpoint it does again.
     left = {
         name: max(entries[name].config.steps - state.env_steps, 0)
@@ -254,8 +273,8 @@ def dry_run(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]
     lines.append(line)
     if unknown:
         lines.append(
-            "unknown: no run of this game's kind, encoder and mode has been timed, here or among published "
-            "ones; start the sweep, and a few minutes later --status says how long it takes"
+            "unknown: no run of this game's kind, encoder, losses and updates has been timed, here or "
+            "among published ones; start the sweep, and a few minutes later --status says how long it takes"
         )
     return lines
 

@@ -156,11 +156,89 @@ def with_reference_scores(games: Iterable[str]) -> list[str]:
     return [game for game in games if game in _reference_scores() or envs.known(game).scores]
 
 
+class Method100k(NamedTuple):
+    """A method whose scores after 100,000 env steps were published, and what these are; None: not known here.
+
+    Attributes:
+        method: its name.
+        basis: "as reported" by its paper, "rerun by Agarwal et al. 2021", or "own runs", which its authors
+            released.
+        level: "runs" where the scores of single runs were released, whose mean and standard deviation these
+            are; "means of games" where the games' means alone are known, so that an interquartile mean of
+            runs is not.
+        runs: of each game, as "100" or "14 to 16".
+        iqm_of_runs: interquartile mean of human-normalised scores of all runs of the 26 games, computed from
+            the released runs with `srl_jax.statistics.interquartile_mean`.
+        sticky_actions: probability.
+        epsilon: of the policy whose scores they are.
+        protocol: what else there is to say.
+        source: repository, revision and file.
+    """
+
+    method: str
+    basis: str
+    level: str
+    runs: str | None
+    iqm_of_runs: float | None
+    sticky_actions: float | None
+    epsilon: float | None
+    protocol: str
+    source: str
+
+
+class Score100k(NamedTuple):
+    """A method's score in a game after 100,000 env steps, raw; None: not known here.
+
+    Attributes:
+        mean: over runs.
+        sd: standard deviation over runs (n - 1).
+        median: over runs.
+        runs: how many.
+    """
+
+    mean: float
+    sd: float | None = None
+    median: float | None = None
+    runs: int | None = None
+
+
+@functools.cache
+def atari100k_methods() -> dict[str, Method100k]:
+    """{name: what is known of it} of the methods with published scores after 100,000 env steps."""
+    return {row["method"]: _record(Method100k, row) for row in _rows("atari100k_methods.csv")}
+
+
+def atari100k(method: str) -> dict[str, Score100k]:
+    """{game: published score after 100,000 env steps} of a method: the 26 games at least.
+
+    Args:
+        method: a key of `atari100k_methods`.
+
+    Raises:
+        KeyError: there is no such method.
+    """
+    return _atari100k()[method]
+
+
+@functools.cache
+def _atari100k() -> dict[str, dict[str, Score100k]]:
+    found: dict[str, dict[str, Score100k]] = {}
+    for name, about in atari100k_methods().items():
+        statistics = {row["statistic"]: row for row in _rows("atari100k.csv") if row["method"] == name}
+        own = found[name] = {}
+        for game in envs.ATARI_57:
+            values = {key: float(row[game]) for key, row in statistics.items() if row[game]}
+            if values:
+                runs = values.pop("runs", None) or about.runs
+                own[game] = Score100k(**values, runs=int(runs) if runs else None)
+    return found
+
+
 def published(game: str) -> list[Published]:
     """Published scores of a game, Random and Human first; [] for one that has none.
 
     Args:
-        game: "Pong", say; seven Atari games have results of learned policies.
+        game: "Pong", say; 55 Atari games have results of learned policies, seven of them of long runs.
     """
     rows = [
         row | {"method": name, "score": row[name.lower()], "score_of": "evaluation", "protocol": _NO_OPS}
@@ -169,10 +247,19 @@ def published(game: str) -> list[Published]:
         for name in ("Random", "Human")
     ]
     rows += [row for row in _rows("published.csv") if row["game"] == game]
-    return [_record(Published, row) for row in rows]
+    of_100k = [
+        Published(
+            game, name, 100_000, score.mean, score.sd, score.runs,
+            "evaluation" if about.level == "runs" else None,
+            about.sticky_actions, about.epsilon, about.protocol, about.source,
+        )
+        for name, about in atari100k_methods().items()
+        if (score := atari100k(name).get(game))
+    ]  # fmt: skip
+    return [_record(Published, row) for row in rows] + of_100k
 
 
-_Record = TypeVar("_Record", Published, ReferencePolicy)
+_Record = TypeVar("_Record", Published, ReferencePolicy, Method100k)
 
 
 def _record(kind: type[_Record], row: Mapping[str, str]) -> _Record:

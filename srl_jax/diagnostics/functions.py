@@ -11,7 +11,7 @@ from srl_jax import weights
 from srl_jax.augment import UNCHANGED, Views
 from srl_jax.latents import make_encoder_gradient
 from srl_jax.modes import Mode
-from srl_jax.optim import RL
+from srl_jax.optim import ENCODER, RL
 from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
 from srl_jax.update import Hyper
 from srl_jax.window import stack_last
@@ -22,16 +22,18 @@ class Functions(NamedTuple):
 
     Attributes:
         encode: (encoder's parameters, frames uint8 [B, S, H, W, C]) -> float32 [B, D].
-        decode: {objective: (head, latents [B, D], Window) -> (errors [B], targets, outputs)}, of those with
+        decode: {objective: (params, latents [B, D], Window) -> (errors [B], targets, outputs)}, of those with
             an image that the latent of s_t is enough for. Errors are squared and averaged over the image. Of
             targets and outputs the newest two frames, float32 [B, 2, H, W, C] (of observations of one frame,
             [B, 1, H, W, C]).
+        groups: of the parameters, which `encode` and `decode` read.
         others: names of objectives with an image that need more than that.
         conflict: `make_conflict`'s; None where RL and representation losses do not both run.
     """
 
     encode: Callable
     decode: Mapping[str, Callable]
+    groups: tuple[str, ...]
     others: tuple[str, ...]
     conflict: Callable | None
 
@@ -49,16 +51,17 @@ def make_functions(
     views: Views = UNCHANGED,
 ) -> Functions:
     """The functions of an agent; C is `channels`, `views` as of `srl_jax.update.make_update`."""
-    images = {name: objective.image for name, objective in objectives.items() if objective.image}
-    decode = {name: _decode(image) for name, image in images.items()}
-    ready = {n: f for n, f in decode.items() if _enough(f, objectives[n], encoder, channels)}
+    decode = {name: _decode(name, objective) for name, objective in objectives.items() if objective.image}
+    ready = {n: f for n, f in decode.items() if _enough(f, n, objectives, encoder, channels)}
+    groups = {ENCODER, *ready, *(group for name in ready for group in objectives[name].reads)}
     conflict = None
     if mode.rl and mode.representation and len(objectives) > 1 and RL in objectives:
         conflict = jax.jit(make_conflict(encoder, objectives, mode, views=views))
     return Functions(
         encode=jax.jit(lambda params, frames: encoder.apply(params, stack_last(frames))),
         decode={name: jax.jit(function) for name, function in ready.items()},
-        others=tuple(images.keys() - ready.keys()),
+        groups=tuple(sorted(groups)),
+        others=tuple(decode.keys() - ready.keys()),
         conflict=conflict,
     )
 
@@ -93,13 +96,17 @@ def make_conflict(
     return conflict
 
 
-def _decode(image: Callable) -> Callable:
-    def decode(head: Params, z: Array, window: Window):
+def _decode(name: str, objective: Objective) -> Callable:
+    image = objective.image
+    assert image
+
+    def decode(params: Mapping[str, Params], z: Array, window: Window):
         def known(k):
             if isinstance(k, int) and k == 0:
                 return z
             raise MoreLatents
 
+        head = objective.head(params[name], objective.read(params))
         target, output = image(head, Latents(known, known), window)
         errors = jnp.mean((output - target) ** 2, (1, 2, 3))
         channels = window.frames.shape[-1]
@@ -114,10 +121,12 @@ def _newest(image: Array, channels: int) -> Array:
     return jnp.moveaxis(frames, -2, 1)
 
 
-def _enough(decode: Callable, objective: Objective, encoder: Encoder, channels: int) -> bool:
+def _enough(
+    decode: Callable, name: str, objectives: Mapping[str, Objective], encoder: Encoder, channels: int
+) -> bool:
     """Whether an image can be made of the latent of s_t; compiles nothing."""
     height, width, depth = encoder.observation_shape
-    steps = max(1, objective.horizon)
+    steps = max(1, objectives[name].horizon)
 
     def shape(dtype, *of):
         return jax.ShapeDtypeStruct((2, *of), dtype)
@@ -125,9 +134,11 @@ def _enough(decode: Callable, objective: Objective, encoder: Encoder, channels: 
     actions, numbers = shape(jnp.int32, steps), shape(jnp.float32, steps)
     frames = shape(jnp.uint8, depth // channels + steps, height, width, channels)
     window = Window(frames, actions, numbers, numbers, numbers, shape(jnp.float32))
-    head = jax.eval_shape(objective.init, jax.random.key(0))
+    inits = {ENCODER: encoder.init} | {n: objective.init for n, objective in objectives.items()}
+    needed = [name, *objectives[name].reads]
+    params = {group: jax.eval_shape(inits[group], jax.random.key(0)) for group in needed}
     try:
-        jax.eval_shape(decode, head, shape(jnp.float32, encoder.features), window)
+        jax.eval_shape(decode, params, shape(jnp.float32, encoder.features), window)
     except MoreLatents:
         return False
     return True

@@ -24,14 +24,17 @@ def pictures(agent: Agent, params: Any, replay: Replay, beta: float) -> dict[str
         replay: what observations are drawn from; nothing is drawn where it is empty.
         beta: the importance weights' exponent.
     """
-    drawn = {n: o.image for n, o in agent.objectives.items() if o.image}
+    drawn = {n: (o, o.image) for n, o in agent.objectives.items() if o.image}
     if not drawn or not len(replay):
         return {}
     window, _ = replay.sample(PICTURES, beta)
 
     def draw(params, window):
         latents = make_latents(agent.encoder, params["encoder"], params["encoder"], window)
-        return {name: image(params[name], latents, window) for name, image in drawn.items()}
+        return {
+            name: image(objective.head(params[name], objective.read(params)), latents, window)
+            for name, (objective, image) in drawn.items()
+        }
 
     made = jax.device_get(jax.jit(draw)(params, window))
     channels = replay.frame_shape[-1]

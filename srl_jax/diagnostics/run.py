@@ -99,8 +99,8 @@ class Diagnostics:
         return plain | {"wall_diag_s": round(time.perf_counter() - began, 3)}
 
     def parts(self, params: Params) -> Params:
-        """Of the parameters those that are kept: the encoder, and heads that make images."""
-        return {name: params[name] for name in ("encoder", *sorted(self._functions.decode))}
+        """Of the parameters those that are kept: the encoder, and what images are made by."""
+        return {name: params[name] for name in self._functions.groups}
 
     def _measure(self, state: TrainState, env_steps: int, window: Window | None, hyper: Hyper):
         held_out, params = self._held_out, self.parts(state.params)
@@ -119,7 +119,7 @@ class Diagnostics:
         }
         if self._config.frame_stack > 1:
             values["moving_share"] = measures.moving_share(held_out.observations)
-        if len(params) > 1:
+        if self._functions.decode:
             values |= self._decoded(params, now, kept)
         if window is not None and self._functions.conflict is not None:
             found = jax.device_get(self._functions.conflict(state._replace(opt_state=None), window, hyper))
@@ -139,17 +139,18 @@ class Diagnostics:
     def _decoded(self, params: Params, now: Kept, kept: dict[int, Kept]) -> dict[str, Any]:
         """The errors of the objectives' decoders."""
 
-        def crossed(name: str, head: Params, latents: np.ndarray) -> float:
-            return float(np.concatenate([e for e, _, _ in self._decode(name, head, latents, CROSSED)]).mean())
+        def crossed(name: str, parts: Params, latents: np.ndarray) -> float:
+            decoded = self._decode(name, parts, latents, CROSSED)
+            return float(np.concatenate([errors for errors, _, _ in decoded]).mean())
 
         values: dict[str, Any] = {}
-        heads = {name: tree for name, tree in params.items() if name != "encoder"}
-        for name, head in heads.items():
+        names = sorted(self._functions.decode)
+        for name in names:
             errors, targets, outputs = (
-                np.concatenate(x) for x in zip(*self._decode(name, head, now.latents, DECODED), strict=True)
+                np.concatenate(x) for x in zip(*self._decode(name, params, now.latents, DECODED), strict=True)
             )
             itself = float(errors[:CROSSED].mean())
-            values[f"decoder_now/{name}"] = [crossed(name, head, then.latents) for then in kept.values()]
+            values[f"decoder_now/{name}"] = [crossed(name, params, then.latents) for then in kept.values()]
             values[f"decoder_now/{name}"] += [itself]
             values[f"encoder_now/{name}"] = []
             if targets.shape[1] == 2:  # else nothing tells what moves
@@ -157,15 +158,15 @@ class Diagnostics:
                 values |= {f"error/{name}/{what}": value for what, value in found.items()}
         for step in kept:
             then = self._read(step, params)
-            for name in heads:
-                error = crossed(name, then[name], now.latents) if then else math.nan
+            for name in names:
+                error = crossed(name, then, now.latents) if then else math.nan
                 values[f"encoder_now/{name}"].append(error)
         return values
 
-    def _decode(self, name: str, head: Params, latents: np.ndarray, number: int) -> list[tuple]:
+    def _decode(self, name: str, params: Params, latents: np.ndarray, number: int) -> list[tuple]:
         """What `Functions.decode` says of the first so many held-out observations, batch by batch."""
         decode, windows = self._functions.decode[name], self._held_out.windows
-        return [jax.device_get(decode(head, latents[p], _rows(windows, p))) for p in _parts(number)]
+        return [jax.device_get(decode(params, latents[p], _rows(windows, p))) for p in _parts(number)]
 
     def _keep(self, encoder: Params) -> Kept:
         observations = self._held_out.observations

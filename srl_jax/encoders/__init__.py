@@ -10,13 +10,14 @@ from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.convolutional import Layer, convolutional_encoder
 from srl_jax.encoders.files import from_npz, to_npz
 from srl_jax.encoders.impala import impala
+from srl_jax.encoders.lix import MOST, Mixing
 from srl_jax.encoders.options import End, Start, with_options
 from srl_jax.plugins import Registry
 from srl_jax.types import Encoder
 
 __all__ = [
     "REGISTRY", "register", "flax_encoder", "from_npz", "to_npz",
-    "a_lix", "der", "impala", "nature", "sac_ae", "tiny",
+    "a_lix", "der", "impala", "mrq", "nature", "sac_ae", "tiny",
 ]  # fmt: skip
 
 
@@ -64,22 +65,64 @@ def der(observation_shape: tuple[int, int, int], start: Start, end: End, *, feat
     return convolutional_encoder(observation_shape, layers, start, end, features=features, least_seen=75 / 84)
 
 
-@with_options
-def a_lix(observation_shape: tuple[int, int, int], start: Start, end: End, *, features: int = 50) -> Encoder:
-    """The encoder of A-LIX on Atari (Cetin et al. 2022, table 7), without its LIX layer.
+LIX_GOAL = 0.75
+"""The discontinuity of gradients that the paper's table 7 asks for."""
 
-    The LIX layer, which mixes neighbouring pixels of the maps at random, is what the paper is about: this row
-    is the baseline below it. The authors have not published their Atari code; in their code for control
-    LayerNorm and tanh follow the linear layer, as `end=layer_norm_tanh` does.
+
+@with_options
+def a_lix(
+    observation_shape: tuple[int, int, int],
+    start: Start,
+    end: End,
+    *,
+    features: int = 50,
+    lix: float = 0.0,
+    lix_goal: float = LIX_GOAL,
+) -> Encoder:
+    """The encoder of A-LIX on Atari (Cetin et al. 2022, table 7).
+
+    In updates its LIX layers mix neighbouring pixels of the maps, see `srl_jax.encoders.lix`. The authors
+    have not published their Atari code; in their code for control LayerNorm and tanh follow the linear layer,
+    as `end=layer_norm_tanh` does.
 
     Args:
         features: size of the linear layer; 0 leaves it out.
+        lix: the radius S, in pixels of the maps, that mixing starts with, 1 in the paper; 0 leaves the LIX
+            layers out.
+        lix_goal: the discontinuity of the gradient that S is tuned to; 0 lets S stay as it is.
+
+    Raises:
+        ValueError: where an option is out of range or the frames are too small, or there is a goal without
+            LIX layers.
+    """
+    if lix > MOST:
+        raise ValueError(f"lix must be at most {MOST:g}")
+    if not lix and lix_goal != LIX_GOAL:
+        raise ValueError("with lix=0 nothing reads lix_goal; give lix, say lix=1, or leave lix_goal out")
+    layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1)]
+    mixing = Mixing(lix, lix_goal) if lix else None
+    return convolutional_encoder(observation_shape, layers, start, end, features=features, lix=mixing)
+
+
+@with_options
+def mrq(observation_shape: tuple[int, int, int], start: Start, end: End, *, features: int = 512) -> Encoder:
+    """The encoder of MR.Q (Fujimoto et al. 2025, appendix B): four layers with ELU.
+
+    At 84 x 84 it sees all but the last 5 rows and columns. Its decoder has ELU, too, and is linear at the
+    end; the paper has none.
+
+    Args:
+        features: size of the linear layer, behind which the default end is LayerNorm and ELU; 0 leaves it
+            out. The authors' LayerNorm has no scale and no bias to learn.
 
     Raises:
         ValueError: where an option is out of range or the frames are too small.
     """
-    layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1)]
-    return convolutional_encoder(observation_shape, layers, start, end, features=features)
+    layers = [Layer(32, 3, 2), Layer(32, 3, 2), Layer(32, 3, 2), Layer(32, 3, 1)]
+    return convolutional_encoder(
+        observation_shape, layers, start, end, features=features, own_end="layer_norm_elu", activation="elu",
+        least_seen=79 / 84,
+    )  # fmt: skip
 
 
 @with_options
@@ -126,6 +169,14 @@ def tiny(observation_shape: tuple[int, int, int], start: Start, end: End, *, fea
 
 REGISTRY = Registry(
     "encoders",
-    {"nature": nature, "der": der, "a_lix": a_lix, "sac_ae": sac_ae, "tiny": tiny, "impala": impala},
+    {
+        "nature": nature,
+        "der": der,
+        "a_lix": a_lix,
+        "sac_ae": sac_ae,
+        "tiny": tiny,
+        "impala": impala,
+        "mrq": mrq,
+    },
 )
 register = REGISTRY.register

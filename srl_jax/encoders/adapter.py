@@ -16,6 +16,7 @@ def flax_encoder(
     shape: tuple[int, int, int],
     *,
     map_shape: tuple[int, int, int] | None = None,
+    noisy: bool = False,
 ) -> Encoder:
     """An `Encoder` whose functions are a flax module's, and a decoder that is another one's.
 
@@ -26,6 +27,7 @@ def flax_encoder(
             all objectives but those that decode. The extra inputs are the last.
         shape: (H, W, S * C).
         map_shape: see `Encoder.map_shape`.
+        noisy: whether the network takes a key behind the observations and then adds noise: `Encoder.train`.
 
     Raises:
         ValueError: the network's output is not [B, D], or it has other variables than parameters. Of the
@@ -48,19 +50,20 @@ def flax_encoder(
         return Decoder(*_functions(decoder_network, z))
 
     init, apply = _functions(network, image)
-    return Encoder(init, apply, features, tuple(shape), make_decoder, map_shape)
+    encoder = Encoder(init, apply, features, tuple(shape), make_decoder, map_shape)
+    return encoder._replace(train=apply) if noisy else encoder
 
 
 def _functions(
     network: nn.Module, example: jax.ShapeDtypeStruct
-) -> tuple[Callable[[jax.Array], Params], Callable[[Params, Array], jax.Array]]:
-    """key -> params, and (params, inputs) -> outputs."""
+) -> tuple[Callable[[jax.Array], Params], Callable[..., jax.Array]]:
+    """key -> params, and (params, inputs, more inputs if any) -> outputs."""
 
     def init(key: jax.Array) -> Params:
         return network.init(key, jnp.zeros(example.shape, example.dtype)).get("params", {})
 
-    def apply(params: Params, x: Array) -> jax.Array:
-        output: Any = network.apply({"params": params}, x)
+    def apply(params: Params, *inputs: Array) -> jax.Array:
+        output: Any = network.apply({"params": params}, *inputs)
         return output
 
     return init, apply

@@ -5,14 +5,23 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jax import Array
 
 from srl_jax.encoders.adapter import flax_encoder
+from srl_jax.encoders.lix import Mixing, mixed, tuned
 from srl_jax.encoders.options import End, Latent, Start
 from srl_jax.layers import Conv, ConvTranspose, Pads
+from srl_jax.optim import ENCODER
 from srl_jax.specs import check_choice
-from srl_jax.types import Encoder
+from srl_jax.types import Array as AnyArray
+from srl_jax.types import Decoder, Encoder, Params
+
+ACTIVATIONS = {"relu": nn.relu, "elu": nn.elu}
+
+RADIUS = "lix_radius"
+"""The name of the radius of local signal mixing among an encoder's parameters."""
 
 PADDINGS = ("valid", "same")
 """See `convolutional_encoder`."""
@@ -30,23 +39,29 @@ class Layer(NamedTuple):
 
 
 class EncoderNetwork(nn.Module):
-    """Convolutions with ReLU, and what makes a latent of their maps.
+    """Convolutions with an activation each, and what makes a latent of their maps.
 
     Attributes:
         layers: the convolutions, from the image on.
         start: of the convolutions.
         pads: the zeros around each layer's input.
         latent: of the last layer's maps.
+        activation: a key of `ACTIVATIONS`.
+        lix: local signal mixing, see `srl_jax.encoders.lix`, of the maps of each layer; None for none.
     """
 
     layers: Sequence[Layer]
     start: Start
     pads: Sequence[Pads]
     latent: Latent
+    activation: str = "relu"
+    lix: Mixing | None = None
 
     @nn.compact
-    def __call__(self, observation: Array) -> Array:
+    def __call__(self, observation: Array, key: Array | None = None) -> Array:
         x = observation
+        if self.lix:
+            radius = self.param(RADIUS, nn.initializers.constant(self.lix.radius, jnp.float32), ())
         init, zero_sum, gain, _ = self.start
         if x.dtype == jnp.uint8:
             gain /= 255.0
@@ -54,7 +69,11 @@ class EncoderNetwork(nn.Module):
             # The first kernel is multiplied by the gain, not the image: the same, with fewer bytes.
             first = i == 0
             conv = Conv(*layer, init, zero_sum and first, gain if first else 1.0, padding=self.pads[i])
-            x = nn.relu(conv(x))
+            x = ACTIVATIONS[self.activation](conv(x))
+            if self.lix and key is not None:
+                x = mixed(x, radius, jax.random.fold_in(key, i))
+        if self.lix and key is not None:
+            x = tuned(x, radius, self.lix.goal)
         return self.latent.encode(x)
 
 
@@ -69,6 +88,7 @@ class DecoderNetwork(nn.Module):
         sizes: (height, width) of each layer's input in the encoder, image first.
         channels: the image's channels.
         sigmoid: whether the last layer's output goes through a sigmoid.
+        activation: the encoder's.
     """
 
     layers: Sequence[Layer]
@@ -78,6 +98,7 @@ class DecoderNetwork(nn.Module):
     sizes: Sequence[tuple[int, int]]
     channels: int
     sigmoid: bool
+    activation: str = "relu"
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -91,7 +112,7 @@ class DecoderNetwork(nn.Module):
             )
             x = layer(x)
             if i:
-                x = nn.relu(x)
+                x = ACTIVATIONS[self.activation](x)
         return nn.sigmoid(x) if self.sigmoid else x
 
 
@@ -106,6 +127,8 @@ def convolutional_encoder(
     sigmoid: bool = False,
     padding: str = "valid",
     least_seen: float = LEAST_SEEN,
+    activation: str = "relu",
+    lix: Mixing | None = None,
 ) -> Encoder:
     """An `Encoder` from a table of layers.
 
@@ -120,6 +143,7 @@ def convolutional_encoder(
         padding: "valid", no zeros where the strides fit, see `layer_sides`; "same", as many on all sides as
             give sides / stride, rounded up: flax's and TensorFlow's SAME.
         least_seen: see `layer_sides`.
+        activation, lix: see `EncoderNetwork`.
 
     Raises:
         ValueError: where the image is too small for the layers, or an option is out of range.
@@ -131,10 +155,33 @@ def convolutional_encoder(
     sizes = tuple(zip(*(layer_sides(side, layers, same, least_seen) for side in sides), strict=True))
     pads = tuple(map(padding_between, sizes, sizes[1:], layers, itertools.repeat(same)))
     latent = end.latent((*sizes[-1], layers[-1].channels), features, own_end)
-    network = EncoderNetwork(layers, start, pads, latent)
-    decoder = DecoderNetwork(layers, start, pads, latent, sizes[:-1], channels, sigmoid)
-    encoder = flax_encoder(network, decoder, observation_shape, map_shape=latent.map_shape)
-    return encoder._replace(steps=tuple(steps(network)))
+    network = EncoderNetwork(layers, start, pads, latent, activation, lix)
+    decoder = DecoderNetwork(layers, start, pads, latent, sizes[:-1], channels, sigmoid, activation)
+    encoder = flax_encoder(
+        network, decoder, observation_shape, map_shape=latent.map_shape, noisy=lix is not None
+    )
+    make_decoder = encoder.make_decoder
+    assert make_decoder
+    return encoder._replace(
+        steps=tuple(steps(network)), make_tied_decoder=lambda: tied(make_decoder(), len(layers))
+    )
+
+
+def tied(decoder: Decoder, layers: int) -> Decoder:
+    """The decoder with the transposes of the encoder's kernels, which it reads, in the place of its own."""
+    mirrored = {f"ConvTranspose_{layers - 1 - i}": f"Conv_{i}" for i in range(layers)}
+
+    def transposed(encoder: Params) -> Params:
+        return {to: {"kernel": jnp.swapaxes(encoder[of]["kernel"], 2, 3)} for to, of in mirrored.items()}
+
+    def init(key: Array) -> Params:
+        drawn = decoder.init(key)
+        return drawn | {name: {"bias": drawn[name]["bias"]} for name in mirrored}
+
+    def apply(params: Params, x: AnyArray) -> Array:
+        return decoder.apply({name: tree | params[ENCODER].get(name, {}) for name, tree in params.items()}, x)
+
+    return Decoder(init, apply, {ENCODER: transposed})
 
 
 def padding_between(
@@ -157,7 +204,7 @@ def steps(network: EncoderNetwork) -> Iterator[dict[str, Any]]:
     for i, layer in enumerate(network.layers):
         padding = network.pads[i]
         yield {"step": "conv", "parameters": f"Conv_{i}", "stride": layer.stride, "padding": padding}
-        yield {"step": "relu"}
+        yield {"step": network.activation}
     yield from network.latent.steps()
 
 

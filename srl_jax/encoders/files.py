@@ -29,8 +29,8 @@ def to_npz(path: str | os.PathLike[str], encoder: Encoder, params: Params, spec:
     `bias`; "flatten" makes [B, D] in the order H, W, C, and "average" the means [B, C] over H and W; "dense"
     is x @ `kernel` + `bias`; "layer_norm" has "epsilon", which is added to the variance, `scale` and `bias`;
     "min_max" is (x - min) / max(max - min, "least"), of a row; "sim_norm" is the softmax of each "group"
-    neighbours in a row; "relu" and "tanh" have nothing. A step's "parameters" is what comes before the / of
-    their names.
+    neighbours in a row; "relu", "tanh" and "elu" have nothing. A step's "parameters" is what comes before
+    the / of their names.
 
     Args:
         path: of the file; what lies there is replaced, once the new one is whole.

@@ -24,8 +24,10 @@ ENDS = {
     "none": (),
     "relu": ("relu",),
     "tanh": ("tanh",),
+    "elu": ("elu",),
     "layer_norm": ("layer_norm",),
     "layer_norm_tanh": ("layer_norm", "tanh"),
+    "layer_norm_elu": ("layer_norm", "elu"),
     "min_max": ("min_max",),
     "sim_norm": ("sim_norm",),
 }
@@ -36,6 +38,7 @@ POOLS = ("none", "average")
 _FUNCTIONS: dict[str, Callable[[Array], Array]] = {
     "relu": nn.relu,
     "tanh": jnp.tanh,
+    "elu": nn.elu,
     "min_max": min_max,
     "sim_norm": functools.partial(sim_norm, group=GROUP),
 }

@@ -18,7 +18,7 @@ import numpy as np
 from srl_jax.errors import ConfigError
 from srl_jax.files.reading import ROWS, parse_json, read_bytes
 
-KINDS = ("train", "eval")
+KINDS = ("train", "eval", "final")
 LEADING = ("kind", "env_steps", "updates", "wall_s")
 """The keys that every row begins with, in this order; the rest follow sorted."""
 
@@ -66,7 +66,7 @@ class MetricsWriter:
         """Writes one row.
 
         Args:
-            kind: "train" or "eval".
+            kind: one of `KINDS`.
             env_steps: agent decisions so far, over all environments.
             updates: gradient updates so far.
             wall_s: seconds since the run began, written to the millisecond.

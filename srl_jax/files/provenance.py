@@ -16,15 +16,22 @@ from typing import Any
 PACKAGES = (
     "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
 )  # fmt: skip
-MADE_BY = ("versions", "git_revision", "environment", "cpus")
+MADE_BY = ("versions", "git_revision", "environment", "cpus", "cores")
 """The keys of `made_by`."""
 ABOUT = (*MADE_BY, "started", "continued")
 """What config.json holds beside the fields of Config."""
 
 
 def made_by() -> dict[str, Any]:
-    """What config.json says of this process: software, and how many CPUs the machine has."""
-    return dict(zip(MADE_BY, (versions(), git_revision(), told_to_xla(), os.cpu_count()), strict=True))
+    """What config.json says of this process: software, how many CPUs there are, and how many for it."""
+    values = versions(), git_revision(), told_to_xla(), os.cpu_count(), cores()
+    return dict(zip(MADE_BY, values, strict=True))
+
+
+def cores() -> int | None:
+    """On how many CPUs this process may run, by its affinity; XLA has as many threads, on which roundings
+    depend."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
 def now() -> str:
@@ -33,7 +40,7 @@ def now() -> str:
 
 
 def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What made a run: {package, environment variable, "git_revision" or "cpus": its values, oldest first}.
+    """What made a run: {what: its values, oldest first}, of packages, environment variables, and the rest.
 
     Args:
         about: the content of config.json. What it does not say at all is left out.

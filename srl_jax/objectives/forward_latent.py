@@ -1,5 +1,8 @@
 """Self-prediction: the latents of the next steps from the latent and the actions, without pixels."""
 
+from collections.abc import Callable
+from typing import TypeAlias
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -7,9 +10,10 @@ import jax.numpy as jnp
 from srl_jax.objectives.networks import DISTANCES, MLP, functions, join, one_hot
 from srl_jax.specs import check_choice, check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
-from srl_jax.update import ema
+from srl_jax.update import ema, periodic
 
-TARGETS = ("slow", "stopped", "gradient")
+Rule: TypeAlias = Callable[[Params, Params, Array], Params]
+TARGETS = ("slow", "periodic", "stopped", "gradient")
 
 
 class LatentDynamics(nn.Module):
@@ -39,6 +43,7 @@ def forward_latent(
     distance: str = "squared",
     target: str = "slow",
     tau: float = 0.99,
+    every: int = 250,
 ) -> Objective:
     """Predicts z_{t+1}, ..., z_{t+steps} from z_t and the actions (thesis, sections 3.2.2 and 7.3).
 
@@ -51,10 +56,13 @@ def forward_latent(
         hidden: width of the dynamics' hidden layer; 0 for linear dynamics (Tang et al. 2023, equation 3).
         residual: whether the dynamics predict the change.
         distance: "squared", a mean over D, or "cosine", `2 - 2 cos`.
-        target: "slow", the latents of a slow copy of the encoder (Ni et al. 2024, section 4); "stopped", the
-            online encoder's, without gradient; "gradient", the online encoder's with gradient, whose least
-            loss is where all latents are the same: it is there to show that they collapse.
+        target: "slow", the latents of a slow copy of the encoder (Ni et al. 2024, section 4); "periodic",
+            likewise, but a copy that is replaced in every k-th update (Fujimoto et al. 2025, MR.Q, algorithm
+            1); "stopped", the online encoder's, without gradient; "gradient", the online encoder's with
+            gradient, whose least loss is where all latents are the same: it is there to show that they
+            collapse.
         tau: of the slow copy, see `srl_jax.update.ema`.
+        every: k of the periodic one, in updates.
 
     Raises:
         ValueError: where an option is out of range.
@@ -62,13 +70,16 @@ def forward_latent(
     check_size("steps", steps)
     check_size("hidden", hidden, least=0)
     check_choice("distance", distance, DISTANCES)
+    check_size("every", every)
     check_choice("target", target, TARGETS)
+    rules: dict[str, Rule] = {"slow": ema(tau), "periodic": periodic(every)}
+    rule = rules.get(target)
     init, apply = functions(LatentDynamics(hidden, residual), context.features, context.num_actions)
     between = jax.vmap(DISTANCES[distance])
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         ahead = [k + 1 for k in range(steps)]
-        targets = latents.slow(ahead) if target == "slow" else latents.online(ahead)
+        targets = latents.slow(ahead) if rule else latents.online(ahead)
         if target == "stopped":
             targets = jax.lax.stop_gradient(targets)
         z = latents.online(0)
@@ -78,4 +89,4 @@ def forward_latent(
             losses += window.valid[:, k] * between(z, targets[k])
         return losses / steps, {}
 
-    return Objective(init, loss, weight, horizon=steps, slow=ema(tau) if target == "slow" else None)
+    return Objective(init, loss, weight, horizon=steps, slow=rule)

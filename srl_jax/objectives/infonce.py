@@ -8,6 +8,7 @@ from srl_jax.objectives.networks import MLP, functions, masked_mean, unit
 from srl_jax.specs import check_choice, check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.update import ema
+from srl_jax.window import only
 
 SIMILARITIES = ("bilinear", "cosine")
 
@@ -66,8 +67,8 @@ def infonce(
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         first, second = jax.random.split(key)
-        anchor = project(head["projection"], latents.of(draw(window, first)).online(0))
-        positive = project(slow_head["projection"], latents.of(draw(window, second)).slow(temporal))
+        anchor = project(head["projection"], latents.of(draw(only(window, 0), first)).online(0))
+        positive = project(slow_head["projection"], latents.of(draw(only(window, temporal), second)).slow(0))
         positive = jax.lax.stop_gradient(positive)
         if similarity == "bilinear":
             logits = anchor @ head["bilinear"] @ positive.T

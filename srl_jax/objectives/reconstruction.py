@@ -108,6 +108,7 @@ def reconstruction(
     patch: int = 12,
     gradient_penalty: float = 0.0,
     spectral_norm: bool = False,
+    tied: bool = False,
 ) -> Objective:
     """Decodes z_t into s_t, by mean squared error on pixels in [0, 1] (thesis, sections 3.1 and 5.4).
 
@@ -123,9 +124,14 @@ def reconstruction(
         spectral_norm: whether the decoder computes with `spectrally_normalised` parameters, which bounds how
             much it stretches latents (Ghosh et al. 2020, section 3.1). `decoder_scale` of the encoder then
             has no effect, and sizes have to come from biases and from the number of kernels.
+        tied: whether the decoder's convolutions have the transposes of the encoder's kernels and biases of
+            their own (Vincent et al. 2010, section 2.1, W' = W^T; thesis, section 3.1.3). The gradient flows
+            into these kernels through both uses, where the mode and the gate let it into the encoder.
+            `decoder_scale` then has no effect, and decoder weight decay is of the rest of the decoder.
 
     Raises:
-        ValueError: where an option is out of range.
+        ValueError: where an option is out of range, or the encoder has no decoder, or with `tied` none whose
+            convolutions mirror its own.
     """
     if not 0 <= masked < 1:
         raise ValueError("masked must be at least 0 and below 1")
@@ -133,7 +139,12 @@ def reconstruction(
         if value < 0:
             raise ValueError(f"{name} must be at least 0")
     check_size("patch", patch)
-    decoder = context.make_decoder()
+    if tied and context.make_tied_decoder is None:
+        raise ValueError(
+            "tied=true needs an encoder of plain convolutions, whose decoder mirrors each of them; give one, "
+            "say nature, or tied=false"
+        )
+    decoder = context.make_tied_decoder() if tied and context.make_tied_decoder else context.make_decoder()
 
     def decode(head: Params, z: Array) -> jax.Array:
         return decoder.apply(spectrally_normalised(head) if spectral_norm else head, z)
@@ -159,7 +170,7 @@ def reconstruction(
             losses += gradient_penalty * jnp.sum(slope**2, -1) / target[0].size
         return losses, {}
 
-    return Objective(decoder.init, loss, weight, is_decoder=True, image=picture)
+    return Objective(decoder.init, loss, weight, is_decoder=True, image=picture, reads=decoder.reads)
 
 
 def shifted_stack(observation: Array, window: Window) -> jax.Array:

@@ -9,10 +9,13 @@ import jax.numpy as jnp
 from srl_jax.layers import Conv, Dense, min_max
 from srl_jax.objectives.networks import cosine_distance, functions, one_hot
 from srl_jax.specs import check_choice, check_size
-from srl_jax.types import Array, Context, Latents, Objective, Params, Window
+from srl_jax.types import Array, Context, Latents, Layer, Objective, Params, Window
 from srl_jax.update import ema
 
 TARGETS = ("slow", "stopped")
+PROJECTIONS = ("own", "rl")
+HIDDEN = 512
+"""The paper's outputs of projection and predictor."""
 
 
 class Transition(nn.Module):
@@ -42,7 +45,8 @@ def spr(
     *,
     weight: float = 5.0,
     steps: int = 5,
-    hidden: int = 512,
+    hidden: int = HIDDEN,
+    projection: str = "own",
     target: str = "slow",
     tau: float = 0.99,
     mask: bool = True,
@@ -57,7 +61,11 @@ def spr(
 
     Args:
         steps: K.
-        hidden: outputs of projection and predictor.
+        hidden: outputs of projection and predictor; of `projection=own`.
+        projection: "own", a linear layer; or "rl", the first layer of RL's head (of a dueling one both
+            streams' layers side by side), as in the paper and in its authors' code: by the means of noisy
+            weights and without ReLU, and the predictor has as many outputs. The gradient flows into that
+            layer, wherever the mode and the gate let it into the encoder.
         target: "slow", slow copies of encoder and projection (the paper's arm without augmentation);
             "stopped", the online ones without gradient (its arm with augmentation).
         tau: of the slow copies, see `srl_jax.update.ema`.
@@ -65,39 +73,58 @@ def spr(
         importance: whether the loss is multiplied by replay's importance weights, as in the authors' code.
 
     Raises:
-        ValueError: where an option is out of range.
+        ValueError: where an option is out of range, or with `projection=rl` RL's head is not trained or has
+            no such layer, or hidden is given.
     """
     check_size("steps", steps)
     check_size("hidden", hidden)
+    check_choice("projection", projection, PROJECTIONS)
     check_choice("target", target, TARGETS)
     features = context.features
     shape = context.map_shape or ()
     if math.prod(shape) != features or len(shape) != 3:
         shape = (1, 1, features)
     init_transition, transition = functions(Transition(tuple(shape)), features, context.num_actions)
-    init_project, project = functions(Dense(hidden), features)
-    init_predict, predict = functions(Dense(hidden), hidden)
+    parts = {"transition": init_transition}
+    if projection == "own":
+        parts["projection"], project = functions(Dense(hidden), features)
+        where, outputs, reads = "projection", hidden, {}
+    else:
+        where, outputs, part, project = _rl_layer(context, hidden)
+        reads = {where: part}
+    parts["predictor"], predict = functions(Dense(outputs), outputs)
 
     def init(key: jax.Array) -> Params:
-        keys = jax.random.split(key, 3)
-        return {
-            "transition": init_transition(keys[0]),
-            "projection": init_project(keys[1]),
-            "predictor": init_predict(keys[2]),
-        }
+        keys = jax.random.split(key, len(parts))
+        return {name: draw(k) for (name, draw), k in zip(parts.items(), keys, strict=True)}
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         ahead = [k + 1 for k in range(steps)]
         behind = (latents.slow(ahead), slow_head) if target == "slow" else (latents.online(ahead), head)
         targets, below = jax.lax.stop_gradient(behind)
-        z: Array = min_max(latents.online(0))
-        losses: Array = jnp.zeros(len(z), jnp.float32)
+        predicted = [min_max(latents.online(0))]
         for k in range(steps):
-            z = transition(head["transition"], z, one_hot(window.actions[:, k], context.num_actions))
-            prediction = predict(head["predictor"], project(head["projection"], z))
-            wanted = project(below["projection"], min_max(targets[k]))
-            counts = window.valid[:, k] if mask else 1.0
-            losses += counts * jax.vmap(cosine_distance)(prediction, wanted)
-        return losses / steps * (window.weight if importance else 1.0), {}
+            action = one_hot(window.actions[:, k], context.num_actions)
+            predicted.append(transition(head["transition"], predicted[-1], action))
+        # All steps at once, [K, B, D]: one product each.
+        prediction = predict(head["predictor"], project(head[where], jnp.stack(predicted[1:])))
+        wanted = project(below[where], min_max(targets))
+        losses = jax.vmap(jax.vmap(cosine_distance))(prediction, wanted)
+        if mask:
+            losses *= window.valid[:, :steps].T
+        return jnp.mean(losses, 0) * (window.weight if importance else 1.0), {}
 
-    return Objective(init, loss, weight, horizon=steps, slow=ema(tau) if target == "slow" else None)
+    slow = ema(tau) if target == "slow" else None
+    return Objective(init, loss, weight, horizon=steps, slow=slow, reads=reads)
+
+
+def _rl_layer(context: Context, hidden: int) -> Layer:
+    """The first layer of RL's head."""
+    if context.rl_layer is None:
+        raise ValueError(
+            "projection=rl needs an RL head that is trained beside it and begins with a linear layer over "
+            "the latent, as those of all rows but iqn do; give projection=own"
+        )
+    if hidden != HIDDEN:
+        raise ValueError("with projection=rl the layer of RL's head has its own size; leave hidden out")
+    return context.rl_layer

@@ -1,5 +1,7 @@
 """Two views of one observation: BYOL, VICReg and Barlow Twins."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 
@@ -8,6 +10,16 @@ from srl_jax.objectives.networks import MLP, cosine_distance, functions
 from srl_jax.specs import check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.update import ema
+from srl_jax.window import only
+
+
+def two_views(draw: Callable, latents: Latents, window: Window, key: jax.Array) -> list[Latents]:
+    """The latents of two views of s_t, which is their offset 0.
+
+    The views are drawn of s_t's frames alone. Heads see both as one batch, [2B, D]; in the encoder, where a
+    batch is large enough as it is, one of twice the size is slower on a CPU.
+    """
+    return [latents.of(draw(only(window, 0), k)) for k in jax.random.split(key)]
 
 
 def byol(
@@ -45,14 +57,12 @@ def byol(
         return {"projection": init_project(first), "predictor": init_predict(second)}
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        one, other = (latents.of(draw(window, k)) for k in jax.random.split(key))
-
-        def between(seen: Latents, wanted: Latents) -> jax.Array:
-            prediction = predict(head["predictor"], project(head["projection"], seen.online(0)))
-            target = jax.lax.stop_gradient(project(slow_head["projection"], wanted.slow(0)))
-            return jax.vmap(cosine_distance)(prediction, target)
-
-        return (between(one, other) + between(other, one)) / 2, {}
+        one, other = two_views(draw, latents, window, key)
+        z = jnp.concatenate([one.online(0), other.online(0)])
+        wanted = jnp.concatenate([other.slow(0), one.slow(0)])  # each view's target is the other's
+        prediction = predict(head["predictor"], project(head["projection"], z))
+        target = jax.lax.stop_gradient(project(slow_head["projection"], wanted))
+        return jnp.mean(jax.vmap(cosine_distance)(prediction, target).reshape(2, -1), 0), {}
 
     return Objective(init, loss, weight, slow=ema(tau))
 
@@ -101,7 +111,8 @@ def vicreg(
     init, expand = functions(MLP(hidden, outputs), context.features)
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        z = [expand(head, latents.of(draw(window, k)).online(0)) for k in jax.random.split(key)]
+        both = [view.online(0) for view in two_views(draw, latents, window, key)]
+        z = jnp.split(expand(head, jnp.concatenate(both)), 2)
         alike = jnp.mean((z[0] - z[1]) ** 2, -1)
         varied = sum(map(variance_loss, z))
         apart = sum(map(covariance_loss, z))
@@ -146,7 +157,8 @@ def barlow(
     init, project = functions(MLP(hidden, outputs), context.features)
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        first, second = (project(head, latents.of(draw(window, k)).online(0)) for k in jax.random.split(key))
+        both = [view.online(0) for view in two_views(draw, latents, window, key)]
+        first, second = jnp.split(project(head, jnp.concatenate(both)), 2)
         correlation = cross_correlation(first, second)
         identity = jnp.eye(outputs, dtype=jnp.float32)
         factor = identity + redundancy * (1 - identity)

@@ -15,7 +15,7 @@ from srl_jax.rl.losses import n_step as n_step_view
 from srl_jax.rl.losses import n_step_one_early
 from srl_jax.rl.values import Values, categorical, implicit_quantile, normal_logits, quantile, scalar
 from srl_jax.specs import check_choice, check_size, option_defaults
-from srl_jax.types import Array, Context, Objective, Params
+from srl_jax.types import Array, Context, Layer, Objective, Params
 from srl_jax.update import ema, periodic
 
 __all__ = ["REGISTRY", "register", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
@@ -46,6 +46,7 @@ class Algorithm(NamedTuple):
         slow: --slow_update_every -> the rule by which the slow copies of head and encoder follow; None where
             there are none.
         acts_slow: whether the slow copies act, in training and in evaluations.
+        first_layer: of the head, for objectives that compute with it; None where there is none over latents.
     """
 
     objective: Objective
@@ -53,6 +54,7 @@ class Algorithm(NamedTuple):
     alpha: float
     slow: Callable[[int], Rule | None] = periodic
     acts_slow: bool = False
+    first_layer: Layer | None = None
 
 
 def q_learner(
@@ -164,6 +166,7 @@ def q_learner(
         alpha=alpha if prioritized else 0.0,
         slow=rules[slow],
         acts_slow=act_with == "slow",
+        first_layer=learner.network.first_layer(),
     )
 
 

@@ -6,6 +6,9 @@ import numpy as np
 from jax import Array
 
 from srl_jax.layers import Dense, NoisyDense, factorised_noise
+from srl_jax.optim import RL
+from srl_jax.types import Array as AnyArray
+from srl_jax.types import Layer, Params
 
 
 class QNetwork(nn.Module):
@@ -81,6 +84,23 @@ class QNetwork(nn.Module):
         """
         size = sum(self._noise_lengths(features)) if self.noisy else 0
         return factorised_noise(key, rows * size).reshape(rows, size)
+
+    def first_layer(self) -> Layer | None:
+        """The head's first layer or layers side by side, by the means of their weights, without ReLU.
+
+        None where something else sees the latent first, an embedding of taus.
+        """
+        if self.cosines:
+            return None
+        names = ["hidden"] if self.shared_hidden else [f"{stream}_hidden" for stream in self._sizes]
+
+        def apply(part: Params, z: AnyArray) -> Array:
+            return jnp.concatenate([z @ part[name]["kernel"] + part[name]["bias"] for name in names], -1)
+
+        def means(head: Params) -> Params:
+            return {name: {which: head[name][which] for which in ("kernel", "bias")} for name in names}
+
+        return Layer(RL, self.hidden * len(names), means, apply)
 
     @property
     def _sizes(self) -> dict[str, int]:

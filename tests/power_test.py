@@ -1,0 +1,121 @@
+"""Tests of srl_jax.statistics.power, and of experiments.power."""
+
+import numpy as np
+import pytest
+from absl import flags
+from scipy import stats
+
+from experiments import power
+from experiments.command_line import flags as config_flags
+from srl_jax import data
+from srl_jax.errors import ConfigError
+from srl_jax.statistics import MOST, runs_needed, smallest_effect, welch_p, welch_power
+from tests.helpers import write_run
+
+
+def _lines(*arguments):
+    values = flags.FlagValues()
+    power.define_flags(values)
+    config_flags.parse(["power", *map(str, arguments)], values)
+    return [line.split() for line in power.report(values)]
+
+
+def test_of_many_runs_it_is_the_noncentral_t_of_equal_spreads():
+    """Cohen (1988), table 2.3: d = 0.5 is found in 80 % with 64 runs an arm."""
+    freedom, quantile = 126, stats.t.ppf(0.975, 126)
+    beyond = stats.nct.sf(quantile, freedom, 0.5 * 32**0.5) + stats.nct.cdf(-quantile, freedom, 0.5 * 32**0.5)
+    assert welch_power(0.5, (1, 1), (64, 64)) == pytest.approx(beyond, abs=2e-4)
+    assert runs_needed(0.5, (1, 1)) == 64 and runs_needed(-5.0, (10, 10)) == 64
+    assert welch_power(5, (10, 10), (64, 64)) == pytest.approx(welch_power(0.5, (1, 1), (64, 64)))
+
+
+@pytest.mark.parametrize(
+    "runs, spreads, effect", [((3, 3), (1, 1), 2), ((2, 4), (1, 3), 4), ((5, 5), (2, 1), 0)]
+)
+def test_it_is_how_often_the_test_finds_a_difference(runs, spreads, effect):
+    """With 40,000 experiments the standard error of a share is at most 0.0025."""
+    rng = np.random.default_rng(0)
+    x, y = (rng.normal(size=(40_000, n)) * spread for n, spread in zip(runs, spreads, strict=True))
+    found = float(np.mean(welch_p(x + effect, y) < 0.05))
+    assert welch_power(effect, spreads, runs) == pytest.approx(found, abs=0.0075)
+    assert welch_power(effect, spreads[::-1], runs[::-1]) == pytest.approx(welch_power(effect, spreads, runs))
+
+
+def test_two_runs_an_arm_by_an_integral_over_their_variances():
+    """Of two runs the variances' ratio is the squared tangent of a uniform angle: by scipy.quad."""
+    assert welch_power(4, (1, 1), (2, 2)) == pytest.approx(0.3027715, abs=2e-6)
+
+
+def test_the_smallest_effect_and_the_runs_needed_are_where_power_reaches_what_is_asked():
+    effect = smallest_effect((1, 2), (4, 6), power=0.9, level=0.99)
+    assert welch_power(effect, (1, 2), (4, 6), level=0.99) == pytest.approx(0.9, abs=1e-3)
+    runs = runs_needed(1.3, (1, 2), power=0.9)
+    found = [welch_power(1.3, (1, 2), (n, n)) for n in (runs - 1, runs)]
+    assert found[0] < 0.9 <= found[1]
+    assert runs_needed(100, (1, 1)) == 2 + (welch_power(100, (1, 1), (2, 2)) < 0.8)
+    assert runs_needed(1e-4, (1, 1)) is None
+
+
+@pytest.mark.parametrize(
+    "call, message",
+    [
+        (lambda: welch_power(1, (1, 0), (2, 2)), "positive"),
+        (lambda: welch_power(1, (1, 1), (2, 1)), "at least 2"),
+        (lambda: smallest_effect((1, 1), (2, 2), power=0.05), "between 0.05 and 1"),
+        (lambda: runs_needed(0, (1, 1)), "effect=0"),
+    ],
+)
+def test_what_it_refuses(call, message):
+    with pytest.raises(ValueError, match=message):
+        call()
+
+
+def test_the_table_of_a_spread():
+    head, row = _lines("--spread=2", "--effect=1", "--seeds=64")
+    assert row == ["-", "2", f"{smallest_effect((2, 2), (64, 64)):.3g}", "80%", "64"]
+    assert _lines("--spread=1,2", "--seeds=4")[1][:4] == ["-", "1", "and", "2"]
+    assert _lines("--spread=1", "--effect=1e-3")[1][-2:] == ["over", f"{MOST:,}"]
+
+
+def test_the_spread_of_runs_is_that_of_their_area(tmp_path):
+    """Areas of a: 0, 1 and 2, SD 1; of b 0, 3 and 6, SD 3; together the root of (1 + 9) / 2."""
+    for arm, step in (("a", 1), ("b", 3)):
+        for seed in range(3):
+            write_run(tmp_path / arm / f"seed{seed}", (step * seed, step * seed), seed=seed)
+    write_run(tmp_path / "few/seed0", (0, 0))
+    head, *rows = _lines(f"--from={tmp_path}", "--effect=2")
+    assert head[0] == "Catch"
+    assert [row[:3] for row in rows[:2]] == [["a", "3", "1"], ["b", "3", "3"]]
+    assert rows[2][:4] == ["all", "arms", "6", f"{5**0.5:.3g}"] and len(rows) == 3
+    assert rows[0][-1] == str(runs_needed(2, (1, 1)))
+    (_, row) = _lines(f"--from={tmp_path}", "--effect=2", "--arm=b", "--arm=a", "--game=Catch")
+    assert row[:7] == ["b", "and", "a", "3", "3", "and", "1"]
+    assert row[-1] == str(runs_needed(2, (3, 1)))
+
+
+def test_published_spreads_are_those_of_the_tables():
+    found = power.of_published("Boxing")
+    der = next(x for x in found if x.name == "DER, 100 runs")
+    assert (der.runs, der.deviation) == (100, data.atari100k("DER, 100 runs")["Boxing"].sd)
+    found = power.of_published("Pong")
+    assert len({x.name for x in found}) == len(found) and all(x.deviation > 0 for x in found)
+    long = next(x for x in found if x.name == "Dopamine Rainbow, 10,000,000 env steps")
+    assert (long.runs, long.deviation) == (5, 0.55)
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        ([], "give one of them"),
+        (["--spread=1", "--from=x"], "give one of them"),
+        (["--spread=0"], "a positive number, not '0'"),
+        (["--spread=1,2,3"], "one or two numbers"),
+        (["--from=published"], "needs a game"),
+        (["--from=published", "--game=Catch"], "--game=Catch: .* needs a game with published spreads"),
+        (["--from=published", "--game=Pong", "--arm=x"], "--arm=x: give it twice"),
+        (["--from=published", "--game=Pong", "--arm=x", "--arm=y"], "--arm=x: Pong: "),
+    ],
+)
+def test_what_the_command_line_refuses(arguments, message):
+    with pytest.raises(ConfigError, match=message):
+        _lines(*arguments)
