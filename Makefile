@@ -19,9 +19,9 @@ STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
 # Tests that start few processes and compile little, half a minute in all.
-FAST := actor api_docs arms augment colours compare config control_groups data docs ending envs_base help metrics \
-	optim plots protocols reading replay replay_machine rl_losses run_data rundir specs statistics sumtree \
-	sweeping_plan sweeping_status window
+FAST := actor api_docs arms augment colours compare config control_groups data diagnostics_measures docs \
+	ending envs_base help metrics optim plots protocols reading replay replay_machine rl_losses run_data rundir specs \
+	statistics sumtree sweeping_plan sweeping_status window
 
 .DEFAULT_GOAL := help
 .PHONY: help install check test train lint docs soak bench bench-gpu bench-install
@@ -49,7 +49,7 @@ check: lint ## check style, types and what is tested fast (under a minute)
 	@$(VENV)/bin/python -m mypy && $(VENV)/bin/python -m pytest -q $(FAST:%=tests/%_test.py) $(ARGS)
 
 test: install ## run all tests, a file at a time in each of two processes
-	@$(VENV)/bin/python -m pytest -q -n 2 --dist loadfile $(ARGS)
+	@$(VENV)/bin/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder $(ARGS)
 
 train: install ## train on Pong for about three minutes (two cores), into a new directory under runs/
 	@$(VENV)/bin/python -m experiments.train $(call unless,--preset=,demo) \

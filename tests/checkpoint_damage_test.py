@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.reading import read_bytes
-from tests.checkpoint_test import flip, make_state, names, whole, write
+from tests.checkpoint_test import flip, make_state, names, write
+from tests.helpers import whole
 
 
 @pytest.fixture(scope="module")

@@ -14,7 +14,7 @@ import pytest
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import checkpoint
-from tests.helpers import identical
+from tests.helpers import identical, whole
 
 CONFIG = Config(game="Catch", frame_size=42, encoder="tiny:features=8", seed=5, lr_rl=1 / 3)
 
@@ -53,13 +53,6 @@ def make_state(arrays=ARRAYS, unchanged=()):
 
 def same_bits(a, b):
     return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
-
-
-def whole(path):
-    """The manifest, if every file is what it says."""
-    manifest = checkpoint.read_manifest(path)
-    checkpoint.verify(manifest)
-    return manifest
 
 
 def names(folder):

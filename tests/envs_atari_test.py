@@ -9,6 +9,7 @@ from srl_jax import envs
 
 pytest.importorskip("ale_py")
 from srl_jax.envs import atari  # noqa: E402
+from tests.players import same  # noqa: E402
 
 
 def test_interface():
@@ -77,10 +78,6 @@ def run(env, steps, mixed_masks=False):
             frames, info = env.reset(options={"reset_mask": mask})
             out += [frames, *info.values()]
     return out
-
-
-def same(a, b):
-    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 @pytest.mark.parametrize("options", [{}, {"sticky_actions": 0.25}])

@@ -11,6 +11,7 @@ from srl_jax import encoders, envs
 from srl_jax.envs import catch
 from srl_jax.envs.games import BACKGROUNDS
 from tests.helpers import jit, random_params
+from tests.players import same
 
 LEFT, NOOP, RIGHT = range(3)
 BOTH = pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
@@ -46,10 +47,6 @@ def record(env, actions):
             frames, info = env.reset(options={"reset_mask": terminated})
             out += [frames, info["state"]]
     return out
-
-
-def same(a, b):
-    return len(a) == len(b) and all(np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
 def put(env, ball_x, ball_y, drift, fall, paddle):

@@ -60,13 +60,10 @@ def test_its_state_is_what_is_seen(few_held_out):
         assert (frame > 0).sum() == len({dot, place})
 
 
-@pytest.mark.parametrize("options", [",grey=true", ""])
-def test_an_environment_of_ones_own_is_trained(options, tmp_path, few_held_out):
-    trained(
-        f"--game={GAME}{options}", "--mode=joint", "--objective=reconstruction", f"--out={tmp_path / 'run'}"
-    )
+def test_an_environment_of_ones_own_is_trained(tmp_path, few_held_out):
+    trained(f"--game={GAME}", "--mode=joint", "--objective=reconstruction", f"--out={tmp_path / 'run'}")
     config = Config.load(tmp_path / "run")
-    assert config.game == envs.canonical(f"{GAME}{options}")
+    assert config.game == envs.canonical(GAME)
     last = [row for row in read_metrics(tmp_path / "run/metrics.jsonl") if row["kind"] == "eval"][-1]
     assert last["env_steps"] == 240 and np.isfinite(last["eval/return_mean"])
     assert {f"diag/probe/{name}" for name in Dot.state_names} <= set(last)

@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+import os
 from collections.abc import Sequence
 from contextlib import contextmanager
 from functools import cache, partial
@@ -46,18 +47,8 @@ NOT_FINITE = Ending("diverged", 330, "loss/rl is not finite after 330 env steps 
 """How a run ended that diverged."""
 
 
-def _compiler_options() -> dict:
-    options = {"xla_backend_optimization_level": 0}
-    faster = options | {"xla_cpu_use_fusion_emitters": False}
-    try:
-        jax.jit(lambda x: x, compiler_options=faster)(0.0)
-    except Exception:  # XLA's options come and go; this one halves the time again
-        return options
-    return faster
-
-
-jit = partial(jax.jit, compiler_options=_compiler_options())
-"""For functions that run a few times only: compiles them several times faster."""
+jit = jax.jit
+"""What conftest.py tells XLA makes it fast."""
 
 HOST_ONLY = (
     "game", "seed", "steps", "buffer_size", "updates_per_step", "learn_start", "gamma", "lr_final_share",
@@ -71,12 +62,11 @@ HOST_ONLY = (
 
 @cache
 def _agent(config: Config, frame_shape: tuple[int, ...], num_actions: int) -> Agent:
-    with mock.patch.object(jax, "jit", jit):
-        return make_agent(config, frame_shape, num_actions)
+    return make_agent(config, frame_shape, num_actions)
 
 
 def agent_of(config: Config, frame_shape=(42, 42, 1), num_actions: int = NUM_ACTIONS) -> Agent:
-    """`make_agent`'s, compiled fast, and once a session for all configurations that mean the same agent."""
+    """`make_agent`'s, once a session for all configurations that mean the same agent."""
     default = {name: getattr(Config(), name) for name in HOST_ONLY}
     return _agent(dataclasses.replace(config, **default), tuple(frame_shape), num_actions)
 
@@ -88,9 +78,17 @@ def seeds_of(agent: Agent, number: int) -> Seeds:
     """`over_seeds`', as often as `agent_of` makes the agent."""
     key = id(agent), number
     if key not in _seeds:  # with the agent, so that no other gets its id
-        with mock.patch.object(jax, "jit", jit):
-            _seeds[key] = agent, over_seeds(agent, number)
+        _seeds[key] = agent, over_seeds(agent, number)
     return _seeds[key][1]
+
+
+@contextmanager
+def optimised():
+    """Has programs that run long compiled as they are outside of tests."""
+    options = {"xla_backend_optimization_level": 3, "xla_cpu_use_fusion_emitters": True}
+    fast = "xla_backend_optimization_level" in os.environ.get("XLA_FLAGS", "")
+    with mock.patch.object(jax, "jit", partial(jax.jit, compiler_options=options) if fast else jax.jit):
+        yield
 
 
 def forget_agents() -> None:
@@ -286,6 +284,13 @@ def write_checkpoint(
     kept = {name: params[name] for name in only or params}
     counts = {"num_actions": NUM_ACTIONS, "env_steps": env_steps, "updates": 1}
     return checkpoint.save(run, kept, config, frame_shape=frame, folder=folder, **counts).path
+
+
+def whole(path: Path) -> checkpoint.Manifest:
+    """The manifest of a checkpoint, or of a run's newest, of which every file is what it says."""
+    manifest = checkpoint.read_manifest(path)
+    checkpoint.verify(manifest)
+    return manifest
 
 
 def latents_of(online: np.ndarray, slow: np.ndarray | None = None) -> Latents:

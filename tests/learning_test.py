@@ -11,6 +11,7 @@ from experiments.presets import preset_values
 from srl_jax.config import Config
 from srl_jax.files.metrics import read_metrics
 from srl_jax.run import loop
+from tests.helpers import optimised
 
 SHORT = {"steps": 24_000, "eval_every": 24_000, "eval_games": 200, "eps_anneal_steps": 8_000}
 
@@ -20,7 +21,8 @@ def run(path, preset, **overrides):
     path.mkdir()
     config = Config(**{**preset_values(preset), **SHORT, **overrides})
     config.save(path)
-    loop.train(config, path, progress=False)
+    with optimised():
+        loop.train(config, path, progress=False)
     rows = read_metrics(path / "metrics.jsonl")
     return rows, rows[-1].get("eval/return_mean")
 

@@ -1,6 +1,5 @@
 """experiments.report: what is on the page, its numbers by hand, and what it refuses."""
 
-import base64
 import csv
 import dataclasses
 import io
@@ -16,18 +15,14 @@ from absl import flags
 from experiments import report
 from experiments.command_line import flags as config_flags
 from experiments.drawing import images, plots
-from experiments.runs import collect
-from experiments.runs.collect import RunData
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
-from srl_jax.run import ending
 from tests import helpers
-from tests.helpers import NOT_FINITE
 
-Image = pytest.importorskip("PIL.Image", reason="needs the extra plots")
+pytest.importorskip("PIL.Image", reason="needs the extra plots")
 pages = pytest.importorskip("experiments.reporting.page", reason="needs the extra plots")
-configs, gallery, numbers, pictures = pages.configs, pages.gallery, pages.numbers, pages.gallery.pictures
+configs, gallery = pages.configs, pages.gallery
 
 ODD = '<b>&"odd"'
 """Of an arm whose name is HTML."""
@@ -308,91 +303,6 @@ def test_the_same_runs_give_the_same_bytes_and_the_rows_are_beside_them(runs, te
         report.report(parsed(f"--out={out}", f"--runs={runs}"))
 
 
-@pytest.fixture(scope="module")
-def two_games(tmp_path_factory):
-    """Three seeds on two games; on Catch three arms, on the other one two. Some have failed or just begun."""
-    root = tmp_path_factory.mktemp("two") / "runs"
-    # Areas: rl 0, 0.25, 0.5; above 1, three times; near 0, 0.25, 0.75. The standard error of rl's mean is
-    # 0.25 / sqrt(3), t of two degrees of freedom 4.303, and those of its difference from above are the same.
-    ends = {"rl": [0.0, 0.5, 1.0], "near": [0.0, 0.5, 1.5], "above": [2.0, 2.0, 2.0]}
-    for game in ("Catch", "CatchDistractor"):
-        for arm, values in ends.items():
-            mode = {"mode": "rl_only" if arm == "rl" else "joint", "game": game}
-            for seed, value in enumerate(values):
-                write_run(root / game / arm / f"seed{seed}", [0.0, value / 2, value], seed=seed, **mode)
-    # It would be the baseline, as its name sorts first.
-    ending.write(write_run(root / "Catch/bad/seed0", [0.0, 9.0]), NOT_FINITE)
-    ending.write(write_run(root / "Catch/rl/seed3", [0.0, 1.0], seed=3), NOT_FINITE)
-    write_run(root / "Catch/begun/seed0", [-1.0], mode="joint")
-    write_run(root / "Catch/pretrain/seed0", mode="pretrain")
-    return root
-
-
-def test_the_sentences_say_what_the_intervals_say(two_games):
-    page = Page(build(two_games, media=False))
-    sentence = "rl has 0.25 [−0.37, 0.87]. Better: above (+0.75 over 0.25). Not told apart: near."
-    assert page.text.count(sentence) == 2
-    table = page.table("Statistics of Catch")
-    assert table["above"][4] == "+0.75 over 0.25 ▲ [+0.13, +1.37]" and "▲" not in table["near"][4]
-    assert list(table) == ["arm", "rl", "above", "near", "random policy", "no-op policy"]
-    # Over games nothing is concluded from a bootstrap that is too narrow.
-    over = page.table("The return at the end, over games")["above"]
-    assert over[0].endswith("too narrow") and "▲" not in over[-1]
-    # Those that failed or have just begun are named, and cut nothing.
-    assert (
-        f"Failed, not compared: Catch / bad / seed 0: {NOT_FINITE.reason} Catch / rl / seed 3:" in page.text
-    )
-    bad, rl = (
-        f"{x} seed{y} left out: {NOT_FINITE.reason} (seed {z})"
-        for x, y, z in (("bad: 1 of 1", "", 0), ("rl: 1 of 4", "s", 3))
-    )
-    begun = "begun: 1 of 1 seed left out: has only begun (seed 0)"
-    assert f"Not compared: {rl} {bad} {begun}" in page.text
-    assert "Catch / begun / seed 0: 200 of 200 env steps" in page.text  # it lacks evaluations
-    assert page.table("Every run")["Catch / bad / seed 0"][1] == "failed"
-    assert (
-        "pretrain" in page.table("Settings in which arms differ")["field"] and "policy" not in page.pictures
-    )
-
-
-def test_pages_of_few_runs(tmp_path, monkeypatch):
-    game = "gymnasium:id=A-v0,grey=true,render=false,frame_skip=1,max_steps=0"
-    for arm in "ab":
-        for seed in range(2):
-            write_run(tmp_path / f"own/{arm}/seed{seed}", (1.0, 2.0 + seed), seed=seed, game=game, gamma=0.9)
-    page = Page(build(tmp_path / "own"))
-    assert list(page.table(f"Statistics of {game}")) == ["arm", "a", "b"]
-    assert "No game with reference scores has runs of every arm" in page.text
-    ending.write(write_run(tmp_path / "failed/a/seed0", [0.0]), NOT_FINITE)
-    page = Page(build(tmp_path / "failed"))
-    assert "there is nothing to compare" in page.text and f"left out: {NOT_FINITE.reason}" in page.text
-    # Several directories, which are named as they are and not by where they lie.
-    write_run(tmp_path / "one/fast_seed0", [0.0, 1.0])
-    write_run(tmp_path / "two/runs/slow", [0.0, 0.5], mode="joint", objectives=("reconstruction",))
-    page = Page(build(tmp_path / "one", tmp_path / "two/runs/slow"))
-    assert list(page.table("Statistics of Catch"))[:3] == ["arm", "fast", "slow"]
-    places = {name: row[-1] for name, row in page.table("Every run").items()}
-    assert places["Catch / fast / seed 0"] == "one/fast_seed0" and places["Catch / slow / seed 0"] == "slow"
-    monkeypatch.chdir(tmp_path / "two/runs/slow")
-    page = Page(build(".."))
-    assert page.table("Every run")["Catch / slow / seed 0"][-1] == "slow" and "Below runs." in page.text
-    assert str(tmp_path) not in page.text
-
-
-def test_other_protocols_are_refused_or_said(tmp_path):
-    write_run(tmp_path / "a/seed0", [0.0, 1.0])
-    write_run(tmp_path / "a/seed1", [0.0, 1.0], gamma=0.5, seed=1)
-    write_run(tmp_path / "b/seed0", [0.0, 1.0], sticky_actions=0.25)
-    with pytest.raises(ConfigError, match="sticky_actions is 0.0 there and 0.25 here; --force"):
-        build(tmp_path)
-    page = Page(build(tmp_path, force=True))
-    assert "Compared by force (--force), though these differ:" in page.text
-    assert "sticky_actions is 0.0 there and 0.25 here" in page.text and "gamma is 0.99" in page.text
-    shutil.rmtree(tmp_path / "b")
-    with pytest.raises(ConfigError, match="gamma is 0.99 there and 0.5 here; --force"):
-        build(tmp_path)
-
-
 @pytest.mark.parametrize(
     ("file", "content", "message"),
     [
@@ -416,98 +326,6 @@ def test_what_is_not_what_training_writes_is_named(runs, tmp_path, monkeypatch, 
     (tmp_path / "runs" / file).write_bytes(content)
     with pytest.raises(ConfigError, match=message):
         build(tmp_path / "runs", force=True)
-
-
-def test_whether_a_run_is_finished():
-    def run(evals, trains, **values):
-        rows = [{"kind": "eval", "env_steps": step, "eval/return_mean": 1.0} for step in evals]
-        rows += [{"kind": "train", "env_steps": step} for step in trains]
-        return RunData("", "Catch", "a", 0, Config(steps=250, eval_every=100, log_every=50, **values), rows)
-
-    assert numbers.finished(run([0, 100, 200], [50, 100, 150, 200, 250]))
-    assert not numbers.finished(
-        run([0, 100, 200], [50, 100, 150, 200])
-    )  # the last row of training is missing
-    assert not numbers.finished(run([0, 100], [250]))  # the last evaluation is
-    assert numbers.finished(run([0, 100], [100], stop_at_return=1.0))
-    assert numbers.finished(run([], [250], mode="pretrain"))
-
-
-def test_a_performance_profile_by_hand():
-    # In Catch 0 is a miss, -1, and 1 a catch, 1: these end at 0.5 and 1, and at 0.
-    ends = {"rl": [[-1.0, 0.0], [-1.0, 1.0]], "joint": [[-1.0, -1.0]]}
-    comparison = numbers.Comparison(np.array([0, 100]), {arm: np.array(x) for arm, x in ends.items()}, None)
-    games, thresholds, found = numbers.profiles({"Catch": comparison})
-    assert games == ["Catch"] and thresholds[0] < 0 and thresholds[-1] == 1.0
-    rl, joint = found["rl"], found["joint"]
-    np.testing.assert_array_equal(rl.point, np.where(thresholds < 0.5, 1.0, 0.5 * (thresholds < 1.0)))
-    np.testing.assert_array_equal(joint.point, thresholds < 0)
-    # Two runs are drawn again as either one twice, or as both.
-    between = (thresholds > 0.5) & (thresholds < 1)
-    assert np.isnan(joint.low).all() and (rl.low[between] == 0).all() and (rl.high[between] == 1).all()
-
-
-@pytest.mark.parametrize("noise", [False, True])
-def test_large_pictures_are_made_smaller(tmp_path, noise):
-    rng = np.random.default_rng(0)
-    shape = (40, 42, 42, 3)
-    frames = rng.integers(0, 256, shape, dtype=np.uint8) if noise else np.zeros(shape, np.uint8)
-    frames[1] = frames[0]
-    path = images.gif(frames, tmp_path / "play.gif", scale=2)
-    limit = 50_000 if noise else path.stat().st_size
-    found = pictures.taken(path, limit)
-    with opened(found) as image:
-        assert found.bytes <= limit and image.size == (84, 84)
-        if noise:  # the first frames, in colour and as fast; the first of them is there twice
-            assert image.info["duration"] == 140 and 1 < image.n_frames < 20
-            shown = np.asarray(image.convert("RGB"))[::2, ::2].astype(int)
-            assert np.abs(shown - frames[0]).mean() < 20  # of 256 colours; a grey one is 50 off
-    assert pictures.taken(tmp_path / "none.gif", limit) is None
-
-
-def test_many_pictures_are_made_smaller_still(tmp_path, monkeypatch):
-    image = np.random.default_rng(0).random((6, 42, 42, 1), np.float32)
-    run = collect.load_run(write_run(tmp_path / "rl/seed0", [0.0]))
-    images.image_panel(image, image, image[::-1], run.path / "figures/reconstruction.png", "")
-    shutil.copy(
-        run.path / "figures/reconstruction.png", run.path / "figures/losses.png"
-    )  # which a report draws
-    monkeypatch.setattr(gallery, "LARGEST_PICTURE", 20_000)
-    games = [numbers.Game("Catch", {"rl": [run]}, True, None)]
-    (shown,) = gallery.own_pictures(games)["Catch"]["png"]
-    with opened(shown.picture) as image:
-        assert image.format == "WEBP" and image.width == pictures.COLUMN
-    larger = (run.path / "figures/reconstruction.png").stat().st_size
-    assert shown.picture.bytes < larger / 1.5 and shown.picture.size == image.size
-
-
-def opened(picture):
-    return Image.open(io.BytesIO(base64.b64decode(picture.source.partition(",")[2])))
-
-
-@pytest.mark.parametrize(("arms", "sizes"), [(0, [0]), (1, [1]), (6, [6]), (7, [4, 4]), (14, [6, 6, 4])])
-def test_arms_are_drawn_in_groups_with_the_baseline(arms, sizes):
-    names = [f"arm{i}" for i in range(arms)]
-    found = gallery.groups(names, "arm3")
-    assert [len(group) for group in found] == sizes and set(sum(found, [])) == set(names)
-    assert arms < 4 or all("arm3" in group for group in found)
-
-
-def test_what_a_run_went_on_under_is_said(tmp_path):
-    run = write_run(tmp_path / "run")
-    about = json.loads((run / "config.json").read_text())
-    changed = {"jax": "1.3", "git_revision": "fedcba9876543210-dirty", "cpus": 8}
-    about["continued"] = [{"env_steps": 100, "changed": changed}]
-    (run / "config.json").write_text(json.dumps(about))
-    found = configs.about(collect.load_run(run))
-    assert found["jax"] == "1.2.3, then 1.3" and found["cpus"] == "none, then 8"
-    assert found["git_revision"] == "0123456789, then fedcba9876-dirty"
-
-
-def test_arms_are_in_the_order_of_their_numbers(tmp_path):
-    for arm in ("weight10", "weight9", "weight100", "joint_50"):
-        write_run(tmp_path / arm / "seed0", [0.0])
-    assert numbers.arms_of(collect.load_runs(tmp_path)) == ["joint_50", "weight9", "weight10", "weight100"]
 
 
 def parsed(*arguments):

@@ -1,15 +1,13 @@
-"""Where a run goes on, --out of experiments.train, and how runs are found on disk: srl_jax.files.resuming."""
+"""Where a run goes on, and --out of experiments.train: srl_jax/files/resuming.py."""
 
 import contextlib
 import dataclasses
 import json
-import os
 import shutil
 
 import numpy as np
 import pytest
 
-from experiments.runs import run_data
 from experiments.train import check_out
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
@@ -18,7 +16,7 @@ from srl_jax.files.resuming import all_to_resume, going_on, to_resume
 from srl_jax.files.rundir import run_directory
 from srl_jax.run import ending
 from srl_jax.training import completed
-from tests.helpers import NOT_FINITE, write_run
+from tests.helpers import NOT_FINITE
 from tests.rundir_test import contents
 
 CONFIG = Config(game="Catch", frame_size=42, steps=500, checkpoint_every=100, num_envs=4)
@@ -401,45 +399,6 @@ def test_a_config_that_cannot_be_written_is_a_save_error(tmp_path, monkeypatch):
     with pytest.raises(SaveError, match=f"--out={tmp_path}/run: No space left on device"):
         with run_directory(tmp_path / "run", CONFIG):
             raise AssertionError("a run began")
-
-
-def test_runs_behind_links_are_found_and_loops_end(tmp_path):
-    root, disk = tmp_path / "cmp", tmp_path / "disk"
-    for name in ("joint_seed1", "joint_seed2", "more/Catch/a/seed0"):
-        write_run(disk / name)
-    write_run(root / "joint_seed0")
-    (root / "joint_seed1").symlink_to(disk / "joint_seed1")
-    (root / "joint_seed2").symlink_to(os.path.relpath(disk / "joint_seed2", root))
-    (root / "more").symlink_to(disk / "more")
-    (root / "again").symlink_to(root / "joint_seed0")  # found by its own name
-    (root / "loop").symlink_to(root)
-    (root / "up").symlink_to("..")  # what lies above is not below
-    (disk / "more/Catch/back").symlink_to(disk / "more")
-    (root / "gone").symlink_to(tmp_path / "nowhere")
-    names = ["joint_seed0", "joint_seed1", "joint_seed2", "more/Catch/a/seed0"]
-    assert run_data.runs_below(root) == [root / name for name in names]
-    # Links alone, and a link to all of it.
-    (root / "joint_seed0").rename(disk / "joint_seed0")
-    (root / "again").unlink()
-    (root / "joint_seed0").symlink_to(disk / "joint_seed0")
-    assert len(run_data.runs_below(root)) == 4
-    (tmp_path / "link").symlink_to(root)
-    assert run_data.runs_below(tmp_path / "link")[0] == tmp_path / "link/joint_seed0"
-    assert run_data.runs_below(root / "joint_seed1") == [root / "joint_seed1"]
-
-
-def test_runs_come_in_the_order_of_their_numbers(tmp_path):
-    for seed in (10, 2, 1):
-        write_run(tmp_path / f"a/seed{seed}")
-    assert [path.name for path in run_data.runs_below(tmp_path)] == ["seed1", "seed2", "seed10"]
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
-def test_what_cannot_be_read_is_said(tmp_path):
-    write_run(tmp_path / "a/seed0")
-    (tmp_path / "b").mkdir(0o000)
-    with pytest.raises(ConfigError, match="b: Permission denied"):
-        run_data.runs_below(tmp_path)
 
 
 def test_a_linked_run_is_gone_on_with_and_not_deleted(tmp_path):

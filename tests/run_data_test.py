@@ -1,4 +1,4 @@
-"""Tests of experiments.runs.run_data: what is drawn is checked first."""
+"""experiments/runs/run_data.py: runs are found, and what is drawn of them is checked first."""
 
 import json
 import os
@@ -7,6 +7,7 @@ import pytest
 
 from experiments.runs import run_data
 from srl_jax.specs import ConfigError
+from tests.helpers import write_run
 
 EVAL = {"kind": "eval", "env_steps": 5, "eval/return_mean": 1.0, "eval/returns": [1.0, None]}
 TRAIN = {"kind": "train", "env_steps": 5, "loss/rl": None, "grad_norm/rl": 2}
@@ -60,3 +61,42 @@ def test_what_is_no_metrics_file_is_refused(tmp_path):
     path.write_text("[" * 100_000 + "\n")
     with pytest.raises(ConfigError, match="line 1: nested too deeply"):
         run_data.read_rows(path)
+
+
+def test_runs_behind_links_are_found_and_loops_end(tmp_path):
+    root, disk = tmp_path / "cmp", tmp_path / "disk"
+    for name in ("joint_seed1", "joint_seed2", "more/Catch/a/seed0"):
+        write_run(disk / name)
+    write_run(root / "joint_seed0")
+    (root / "joint_seed1").symlink_to(disk / "joint_seed1")
+    (root / "joint_seed2").symlink_to(os.path.relpath(disk / "joint_seed2", root))
+    (root / "more").symlink_to(disk / "more")
+    (root / "again").symlink_to(root / "joint_seed0")  # found by its own name
+    (root / "loop").symlink_to(root)
+    (root / "up").symlink_to("..")  # what lies above is not below
+    (disk / "more/Catch/back").symlink_to(disk / "more")
+    (root / "gone").symlink_to(tmp_path / "nowhere")
+    names = ["joint_seed0", "joint_seed1", "joint_seed2", "more/Catch/a/seed0"]
+    assert run_data.runs_below(root) == [root / name for name in names]
+    # Links alone, and a link to all of it.
+    (root / "joint_seed0").rename(disk / "joint_seed0")
+    (root / "again").unlink()
+    (root / "joint_seed0").symlink_to(disk / "joint_seed0")
+    assert len(run_data.runs_below(root)) == 4
+    (tmp_path / "link").symlink_to(root)
+    assert run_data.runs_below(tmp_path / "link")[0] == tmp_path / "link/joint_seed0"
+    assert run_data.runs_below(root / "joint_seed1") == [root / "joint_seed1"]
+
+
+def test_runs_come_in_the_order_of_their_numbers(tmp_path):
+    for seed in (10, 2, 1):
+        write_run(tmp_path / f"a/seed{seed}")
+    assert [path.name for path in run_data.runs_below(tmp_path)] == ["seed1", "seed2", "seed10"]
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
+def test_what_cannot_be_read_is_said(tmp_path):
+    write_run(tmp_path / "a/seed0")
+    (tmp_path / "b").mkdir(0o000)
+    with pytest.raises(ConfigError, match="b: Permission denied"):
+        run_data.runs_below(tmp_path)
