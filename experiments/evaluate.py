@@ -63,7 +63,7 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     if FLAGS.gif:
         check_gif(FLAGS.gif)
     from srl_jax.files import checkpoint
-    from srl_jax.modes import MODES
+    from srl_jax.learning.modes import MODES
 
     config = checkpoint.read_manifest(FLAGS.run).config
     if not MODES[config.mode].rl:

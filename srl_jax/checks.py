@@ -3,9 +3,9 @@
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
-from srl_jax import annealing
 from srl_jax.errors import ConfigError
-from srl_jax.modes import MODES, PROJECTING, Mode, both_train, of, ratios, two_optimizers
+from srl_jax.learning import annealing
+from srl_jax.learning.modes import MODES, PROJECTING, Mode, both_train, of, ratios, two_optimizers
 from srl_jax.needs import EVERYTHING, UNKNOWN, Run
 
 if TYPE_CHECKING:

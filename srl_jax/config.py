@@ -11,10 +11,11 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from srl_jax import annealing, checks, envs, modes, specs
+from srl_jax import checks, envs, specs
 from srl_jax.errors import ConfigError
 from srl_jax.files import provenance
 from srl_jax.files.reading import parse_json, read_json, replace_text
+from srl_jax.learning import annealing, modes
 from srl_jax.specs import Info
 
 SOURCES = ("encoder_from", "policy_from")
@@ -441,16 +442,3 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
     """What differs of these fields, `steps is 1000 there and 2000 here, ...`; "" if nothing."""
     pairs = ((name, getattr(there, name), getattr(here, name)) for name in names)
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
-
-
-ENDS = ("steps", "stop_at_return")
-"""Fields that say when a run ends."""
-MAY_CHANGE = (*ENDS, "keep_replay", "keep_best", "imports", "loggers")
-"""Fields that may change when a run is resumed: when it ends, what it leaves, its plug-ins and loggers."""
-
-
-def another_run(there: Config, here: Config) -> str:
-    """`difference` of what makes two runs two: neither `MAY_CHANGE` nor where the sources lie by now."""
-    same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
-    same |= {name: getattr(there, name) for name in MAY_CHANGE}
-    return difference(there, dataclasses.replace(here, **same))

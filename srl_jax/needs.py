@@ -1,7 +1,7 @@
 """What an option or a flag needs beside it to be read at all; where that is missing, it is refused.
 
 A need is a text: `noisy=true`, `masked!=0`, the name of a fact of the run, or several of these with commas,
-all of which must hold. `srl_jax.modes.NEEDS` has those of the fields of Config, and `FACTS` beside it the
+all of which must hold. `srl_jax.checks.NEEDS` has those of the fields of Config, and `FACTS` beside it the
 facts; an option of a row has its need by `srl_jax.specs.needs`. What a need names is another option of the
 same row, a field of Config, or an option of --rl, `rl:prioritized=true`. Imports no jax.
 

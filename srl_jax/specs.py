@@ -146,7 +146,7 @@ class Weight(float):
         final: where it goes to, linearly, and then stays.
         steps: env steps until it is there; 0 where it does not change.
         ratio: whether it is the share of RL's gradient on the encoder that the objective's is held at, see
-            `srl_jax.weights`, and not a factor of the loss.
+            `srl_jax.learning.weights`, and not a factor of the loss.
     """
 
     final: float

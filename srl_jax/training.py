@@ -87,9 +87,9 @@ def resolved(config: Config, given: Collection[str] = ()) -> Config:
             these frames, or there is no such view, or a logger's package is missing, or nothing reads what
             was given.
     """
-    from srl_jax.agent import components
     from srl_jax.augment import Views
     from srl_jax.files import loggers
+    from srl_jax.learning.agent import components
 
     if config.imports:
         plugins.load(config.imports)

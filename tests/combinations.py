@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from srl_jax import checks, encoders, modes, objectives, rl, specs, train
+from srl_jax import checks, encoders, objectives, rl, specs, train
 from srl_jax.config import Config
 from srl_jax.encoders.options import ENDS, POOLS
 from srl_jax.envs.games import BACKGROUNDS
@@ -16,6 +16,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.rundir import run_directory
 from srl_jax.layers import INITIALISERS
+from srl_jax.learning import modes
 from srl_jax.run import loop
 from srl_jax.training import completed
 from tests.helpers import write_checkpoint

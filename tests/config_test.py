@@ -1,4 +1,4 @@
-"""Tests of srl_jax.config and of srl_jax.modes, which a config is checked against."""
+"""Tests of srl_jax.config and of srl_jax.learning.modes, which a config is checked against."""
 
 import dataclasses
 import datetime
@@ -10,11 +10,12 @@ import hypothesis
 import pytest
 from hypothesis import strategies as st
 
-from srl_jax import checks, modes
+from srl_jax import checks
 from srl_jax import config as config_module
 from srl_jax.config import INFOS, Config, difference, resolve
 from srl_jax.errors import ConfigError
 from srl_jax.files import provenance
+from srl_jax.learning import modes
 from srl_jax.specs import LIMITS
 
 

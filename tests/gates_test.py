@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from srl_jax import checks
-from srl_jax.agent import make_agent
 from srl_jax.errors import ConfigError
-from srl_jax.modes import GATES, MODES, PROJECTING
-from srl_jax.optim import PROJECTIONS, RL, make_optimizer
+from srl_jax.learning.agent import make_agent
+from srl_jax.learning.modes import GATES, MODES, PROJECTING
+from srl_jax.learning.optim import PROJECTIONS, RL, make_optimizer
+from srl_jax.learning.update import Hyper, make_init, make_update, passes
 from srl_jax.types import Objective
-from srl_jax.update import Hyper, make_init, make_update, passes
 from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_encoder, make_window, random_state
 from tests.modes_test import FRAME, TERMS, WINDOW, small
 

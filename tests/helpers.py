@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.agent import Agent, Seeds, make_agent, over_seeds
 from srl_jax.config import Config
 from srl_jax.files import checkpoint
+from srl_jax.learning.agent import Agent, Seeds, make_agent, over_seeds
 from srl_jax.run import ending
 from srl_jax.run.ending import Ending
 from srl_jax.types import Context, Decoder, Encoder, Latents, Objective, TrainState, Window

@@ -10,12 +10,12 @@ import pytest
 
 from experiments import packing
 from srl_jax import checks, encoders, envs, objectives, rl, specs
-from srl_jax.agent import components
 from srl_jax.checks import NEEDS
 from srl_jax.config import INFOS, Config, unresolved
 from srl_jax.encoders.options import ENDS, POOLS
 from srl_jax.errors import ConfigError
 from srl_jax.layers import INITIALISERS
+from srl_jax.learning.agent import components
 from srl_jax.needs import EVERYTHING, Unread
 from srl_jax.rl.values import PRIORITIES
 from srl_jax.training import built, completed

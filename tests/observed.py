@@ -7,11 +7,11 @@ from functools import partial
 import jax
 import numpy as np
 
-from srl_jax.agent import make_agent
 from srl_jax.config import Config
-from srl_jax.latents import make_latents
-from srl_jax.optim import ENCODER, RL
-from srl_jax.resets import reset
+from srl_jax.learning.agent import make_agent
+from srl_jax.learning.latents import make_latents
+from srl_jax.learning.optim import ENCODER, RL
+from srl_jax.learning.resets import reset
 from srl_jax.rl import REGISTRY, Algorithm
 from srl_jax.run.schedules import Schedules
 from srl_jax.types import Context, Encoder, Objective

@@ -13,9 +13,10 @@ from experiments.presets import (
     source_preset,
     summary,
 )
-from srl_jax import checks, encoders, modes, objectives, rl, specs
+from srl_jax import checks, encoders, objectives, rl, specs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from srl_jax.learning import modes
 
 # The arms of every figure of the thesis, and the runs that make their encoders.
 ARMS = [

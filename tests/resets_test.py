@@ -1,4 +1,4 @@
-"""srl_jax/resets.py and srl_jax/annealing.py: what a reset leaves, and when; n and gamma after it."""
+"""srl_jax/learning/resets.py and annealing.py: what a reset leaves, and when; n and gamma after it."""
 
 from functools import partial
 
@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import annealing, checks
+from srl_jax import checks
 from srl_jax.config import Config, resolve
 from srl_jax.errors import ConfigError
-from srl_jax.modes import MODES
+from srl_jax.learning import annealing
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import make_optimizer
+from srl_jax.learning.resets import reset, reset_key
+from srl_jax.learning.update import Hyper, make_init, passes, periodic
 from srl_jax.objectives import REGISTRY
-from srl_jax.optim import make_optimizer
-from srl_jax.resets import reset, reset_key
 from srl_jax.rl import rainbow
 from srl_jax.run.schedules import Schedules, printed
 from srl_jax.types import TrainState
-from srl_jax.update import Hyper, make_init, passes, periodic
 from tests.helpers import fill, identical, make_context, make_encoder
 
 BBF = dict(

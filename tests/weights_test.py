@@ -10,20 +10,21 @@ import jax
 import numpy as np
 import pytest
 
-from srl_jax import checks, modes, objectives, specs, weights
-from srl_jax.agent import make_agent
+from srl_jax import checks, objectives, specs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
-from srl_jax.modes import MODES
-from srl_jax.optim import RL, make_optimizer
+from srl_jax.learning import modes, weights
+from srl_jax.learning.agent import make_agent
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import RL, make_optimizer
+from srl_jax.learning.update import NORM_EVERY, Hyper, make_init, make_update, passes
+from srl_jax.learning.weights import DECAY, make_norms
 from srl_jax.run import loop, seed
 from srl_jax.run.schedules import Schedules
 from srl_jax.specs import Weight, parse_weight
 from srl_jax.types import Objective
-from srl_jax.update import NORM_EVERY, Hyper, make_init, make_update, passes
-from srl_jax.weights import DECAY, make_norms
 from tests.helpers import SMALL, jit, make_context, make_encoder, make_window, random_state
 
 

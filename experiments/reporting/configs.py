@@ -10,7 +10,7 @@ from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
 from srl_jax.files.provenance import history
-from srl_jax.modes import MODES
+from srl_jax.learning.modes import MODES
 
 from ..runs import collect
 from ..runs.collect import RunData

@@ -15,7 +15,7 @@ from srl_jax import checks, specs, statistics
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.data import Published, ReferencePolicy
 from srl_jax.errors import ConfigError
-from srl_jax.modes import MODES
+from srl_jax.learning.modes import MODES
 
 from .. import packing
 from .run_data import RunData, arm_name, in_order, load_run, run_directories

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax.config import INFOS, Config, another_run, difference
+from srl_jax.config import INFOS, Config, difference
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files import checkpoint, resuming, rundir
 from srl_jax.files.checkpoint import NUMBERS, PARAMS
@@ -72,7 +72,7 @@ def look(path: Path, config: Config) -> State:
         return State("resumable")  # from an older one, or not begun: the run itself finds out
     ended = ending.read(path)
     over = NUMBERS not in found.files or (ended is not None and ended.status == "finished")  # --keep_replay
-    if not over or _alike(another_run, found.config, config):
+    if not over or _alike(resuming.another_run, found.config, config):
         return State("resumable", found.env_steps)
     lacks = _lacks(path, found)
     return State("resumable" if lacks else "done", found.env_steps, lacks)

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.layers import Conv, Dense, min_max
+from srl_jax.learning.update import ema
 from srl_jax.objectives.networks import cosine_distance, functions, one_hot
 from srl_jax.specs import check_choice, check_size, needs
 from srl_jax.types import Array, Context, Latents, Layer, Objective, Params, Window
-from srl_jax.update import ema
 
 TARGETS = ("slow", "stopped")
 PROJECTIONS = ("own", "rl")
@@ -69,7 +69,7 @@ def spr(
             layer, wherever the mode and the gate let it into the encoder.
         target: "slow", slow copies of encoder and projection (the paper's arm without augmentation);
             "stopped", the online ones without gradient (its arm with augmentation).
-        tau: of the slow copies, see `srl_jax.update.ema`.
+        tau: of the slow copies, see `srl_jax.learning.update.ema`.
         mask: whether steps behind the end of an episode count 0, as in the authors' code.
         importance: whether the loss is multiplied by replay's importance weights, as in the authors' code.
 

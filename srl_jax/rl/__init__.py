@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import jax
 
 from srl_jax.augment import make_view
+from srl_jax.learning.update import ema, periodic
 from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.learner import Munchausen, QLearner
@@ -16,7 +17,6 @@ from srl_jax.rl.losses import n_step_one_early
 from srl_jax.rl.values import Values, categorical, implicit_quantile, normal_logits, quantile, scalar
 from srl_jax.specs import check_choice, check_size, needs, needs_of, option_defaults
 from srl_jax.types import Array, Context, Layer, Objective, Params
-from srl_jax.update import ema, periodic
 
 __all__ = ["REGISTRY", "register", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
 
@@ -119,7 +119,7 @@ def q_learner(
         slow: how the slow copies of encoder and head follow: "periodic", replaced after each
             --slow_update_every updates; "ema", a moving average; "none", the online ones without gradient
             take their place.
-        slow_tau: of the moving average, the share that stays in an update, see `srl_jax.update.ema`.
+        slow_tau: of the moving average, the share that stays in an update, see `srl_jax.learning.update.ema`.
         act_with: whether the "online" or the "slow" network acts, in training and in evaluations.
         target: the state bootstrapped from; "s_t+n-1" is a defect of the buffers of Dopamine's Atari 100k
             agents and of BBF, see `srl_jax.rl.losses.n_step_one_early` and docs/deviations.md.

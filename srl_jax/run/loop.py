@@ -1,9 +1,9 @@
 """The host loop of one seed, or of several in step: act, step, add, sample, update; evaluate and checkpoint.
 
-The device's state has an axis of seeds (`srl_jax.agent.over_seeds`), and the host keeps a `Seed` for each.
-Threads act, step and reset the environments while the main thread has the device update. Both start from the
-parameters and the replay of the step before, and they meet before the next step. Evaluations have threads of
-their own and are awaited before the next row is written. So no result depends on timing.
+The device's state has an axis of seeds (`srl_jax.learning.agent.over_seeds`), and the host keeps a `Seed`
+for each. Threads act, step and reset the environments while the main thread has the device update. Both start
+from the parameters and the replay of the step before, and they meet before the next step. Evaluations have
+threads of their own and are awaited before the next row is written. So no result depends on timing.
 """
 
 import contextlib
@@ -16,13 +16,14 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from srl_jax.agent import Agent, make_agent, over_seeds
 from srl_jax.config import Config
 from srl_jax.diagnostics.pictures import pictures
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.files.checkpoint import Manifest
+from srl_jax.learning.agent import Agent, make_agent, over_seeds
+from srl_jax.learning.resets import reset, reset_key
+from srl_jax.learning.update import NORM_EVERY, named_key
 from srl_jax.loading import given_policy, initial_params
-from srl_jax.resets import reset, reset_key
 from srl_jax.run import ending, saving
 from srl_jax.run.actor import make_env, yielding_threads
 from srl_jax.run.ending import Ending
@@ -30,7 +31,6 @@ from srl_jax.run.evaluations import FINAL, Evaluating
 from srl_jax.run.schedules import Now, Schedules, passed
 from srl_jax.run.seed import Seed
 from srl_jax.types import Params
-from srl_jax.update import NORM_EVERY, named_key
 
 FETCH_EVERY = 100
 """Updates after which their metrics are fetched from the device, so that few wait there between two rows."""
@@ -292,7 +292,7 @@ class Run:
         self.env_steps += self.config.num_envs
 
     def reset(self, number: int) -> None:
-        """The number-th reset of the run; see `srl_jax.resets`."""
+        """The number-th reset of the run; see `srl_jax.learning.resets`."""
         fresh = [self.agent.init(reset_key(seed.key, number), {}) for seed in self.seeds]
         self.state = reset(self.state, self.device.stack(fresh), self.config.reset, self.config.shrink)
         self.seeds[0].report.progress.note(f"reset {number} after {self.env_steps} env steps")

@@ -18,7 +18,7 @@ from srl_jax.files.metrics import Mark, MetricsWriter, read_metrics
 from srl_jax.run.evaluate import Evaluation
 
 SOMETIMES = ("grad_norm/", "step_ratio/")
-"""How the names of metrics begin that only some updates measure; see `srl_jax.optim.NOT_MEASURED`."""
+"""How the names of metrics begin that only some updates measure: `srl_jax.learning.optim.NOT_MEASURED`."""
 
 
 class Means:

@@ -7,11 +7,11 @@ from typing import Any
 
 import jax
 
-from srl_jax.agent import Agent
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
-from srl_jax.optim import real_copy
+from srl_jax.learning.agent import Agent
+from srl_jax.learning.optim import real_copy
 from srl_jax.types import Params, TrainState
 
 

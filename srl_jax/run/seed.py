@@ -8,12 +8,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from srl_jax.agent import Agent
-from srl_jax.config import ENDS, Config, difference
+from srl_jax.config import Config, difference
 from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
+from srl_jax.files.resuming import ENDS
+from srl_jax.learning.agent import Agent
 from srl_jax.replay import Replay, fitting
 from srl_jax.run import saving
 from srl_jax.run.actor import FrameStack, Policy, random_policy, seed_for

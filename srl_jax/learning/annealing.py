@@ -8,7 +8,7 @@ from srl_jax.specs import Spec, parse_change, value_text
 
 if TYPE_CHECKING:
     from srl_jax.config import Config
-    from srl_jax.modes import Mode
+    from srl_jax.learning.modes import Mode
 
 
 class Anneal(NamedTuple):

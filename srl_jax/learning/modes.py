@@ -12,7 +12,7 @@ if TYPE_CHECKING:
 
 
 ENCODER_OPTIMIZERS = ("separate", "summed", "simultaneous")
-"""How two kinds of loss step one encoder: see `srl_jax.update.passes`."""
+"""How two kinds of loss step one encoder: see `srl_jax.learning.update.passes`."""
 
 GATES = {
     "sum": "whatever the mode lets through is added up",
