@@ -133,6 +133,16 @@ _SAME = {"encoder_from": "encoder", "policy_from": "game"}
 """What a run must have in common with the one that a flag names, beside how frames are made."""
 
 
+def _written_out(encoder: str) -> str:
+    """A specification with the options that the encoder has by now; as it is where it is none."""
+    from srl_jax import encoders
+
+    try:
+        return specs.parse(encoder, encoders.REGISTRY, "encoder").full
+    except ConfigError:
+        return encoder
+
+
 def check_sources(config: Config) -> None:
     """Whether the checkpoints that a run wants to start from exist and fit it; reads manifests alone.
 
@@ -153,7 +163,7 @@ def check_sources(config: Config) -> None:
         for field in (own, "frame_size", "frame_stack"):
             what = {"encoder": "architecture", "game": "game"}.get(field, "preprocessing")
             ours, theirs = getattr(config, field), getattr(found, field)
-            if ours != theirs:
+            if ours != theirs and (field != "encoder" or _written_out(ours) != _written_out(theirs)):
                 raise ConfigError(
                     f"--{flag}={path}: the {what} differs: {field} is {theirs} there and {ours} here"
                 )
