@@ -1,4 +1,4 @@
-"""Tests of experiments.coverage: why differences of few seeds have t intervals."""
+"""Tests of experiments.analyses.coverage: why differences of few seeds have t intervals."""
 
 import itertools
 import json
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments import coverage
+from experiments.analyses import coverage
 from experiments.runs import populations
 from srl_jax import statistics
 

@@ -1,4 +1,4 @@
-"""How often 95 % intervals of few runs contain the truth: `python -m experiments.coverage`.
+"""How often 95 % intervals of few runs contain the truth: `python -m experiments.analyses.coverage`.
 
 Simulates experiments whose truth is known, on returns from formulas, from the runs in results/catch_runs.json
 and from published spreads, and prints which share of each kind of interval contains the truth, in percent.
@@ -17,10 +17,10 @@ from srl_jax import data, statistics
 from srl_jax.files import display
 from srl_jax.specs import Info
 
-from .command_line import flags as config_flags
-from .command_line import paths
-from .reporting import texts
-from .runs import populations
+from ..command_line import flags as config_flags
+from ..command_line import paths
+from ..reporting import texts
+from ..runs import populations
 
 FLAGS = flags.FLAGS
 RUNS = (2, 3, 5, 7, 10, 20)
