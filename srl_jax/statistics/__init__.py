@@ -32,8 +32,8 @@ game and the others do not; experiments/results/coverage has the table):
 
 That Welch's interval leaves out 0 is therefore a two-sided test at about 5 %, at worst at 7 %, from 3 runs on
 and nearly so from 2. That a bootstrap interval does is none with few runs: its kind says so below `ENOUGH` of
-them. Where runs are of two kinds, no interval of the mean of 2 to 5 of them holds what it says, nor Welch's of a
-difference from an arm that has one kind.
+them. Where runs are of two kinds, no interval of the mean of 2 to 5 of them holds what it says, nor does
+Welch's of a difference from an arm that has one kind.
 `welch_power`, `smallest_effect` and `runs_needed` say how many runs a difference takes.
 """
 
