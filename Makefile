@@ -20,7 +20,7 @@ unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
 # Tests that start few processes and compile little, half a minute in all.
 FAST := actor api_docs arms augment colours compare config control_groups data diagnostics_measures docs \
-	ending envs_base help metrics optim plots reading replay replay_machine rl_losses run_data rundir specs \
+	ending envs_base help metrics optim plots protocols reading replay replay_machine rl_losses run_data rundir specs \
 	statistics sumtree sweeping_plan sweeping_status window
 
 .DEFAULT_GOAL := help

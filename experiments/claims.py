@@ -21,6 +21,7 @@ from srl_jax.files import display
 
 from . import coverage
 from .command_line import flags as config_flags
+from .command_line import paths
 from .drawing import plots
 from .reporting import texts
 from .runs import populations
@@ -313,7 +314,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
 def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
-    out = config_flags.check_place("out", FLAGS.out) if FLAGS.out else None
+    out = paths.check_place("out", FLAGS.out) if FLAGS.out else None
     if out is not None and not plots.available():
         raise ConfigError("--out: needs matplotlib and Pillow: pip install 'srl-jax[plots]'")
     found = analyse(populations.chosen())

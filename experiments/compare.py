@@ -21,6 +21,7 @@ from srl_jax.files import display
 from srl_jax.files.metrics import LEADING
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .drawing import plots
 from .drawing.colours import styles
 from .runs import collect
@@ -78,7 +79,10 @@ def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[
         raise ConfigError(
             f"--runs: of different games, {', '.join(games)}; --force compares them all the same"
         )
-    notes = collect.check_protocols(runs, force=force) if key.startswith("eval/") else []
+    notes = []
+    if key.startswith(("eval/", "final/")):
+        more = ("final_games",) if key.startswith("final/") else ()
+        notes = collect.check_protocols(runs, force=force, more=more)
     whys = {run.path: why for run, why in collect.left_out(runs, key)}
     arms = []
     for members in found:
@@ -120,16 +124,11 @@ def differing(arms: Sequence[Arm]) -> dict[str, list[str]]:
 
 
 def _settings(config: Config) -> dict[str, str]:
-    found = {}
-    for field, info in INFOS.items():
-        flag, value = info.flag or field, getattr(config, field)
-        if field in ("rl", "encoder", "objectives"):
-            rows = [specs.split(text) for text in (value if isinstance(value, tuple) else (value,))]
-            found[flag] = "+".join(name for name, _ in rows) or "none"
-            found |= {f"{row}:{option}": text for row, options in rows for option, text in options.items()}
-        elif field not in ("game", *collect.OF_A_SEED):
-            found[flag] = _text(value)
-    return found
+    return {
+        f"{row}:{option}" if row else INFOS[field].flag or field: value if row else _text(value)
+        for field, row, option, value in collect.settings(config)
+        if field not in collect.OF_A_SEED
+    }
 
 
 def _text(value: Any) -> str:
@@ -215,7 +214,7 @@ def compare(values: flags.FlagValues) -> None:
         raise ConfigError("--runs: missing; name two, srl-jax compare runs/a runs/b")
     roots = list(dict.fromkeys(Path(os.path.expanduser(root)) for root in values["runs"].value))
     key, out = values["key"].value, values["out"].value
-    path = config_flags.check_file("out", out, ".png", overwrite=values["overwrite"].value) if out else None
+    path = paths.check_file("out", out, ".png", overwrite=values["overwrite"].value) if out else None
     if path and not plots.available():
         raise ConfigError("--out: needs matplotlib and Pillow: pip install 'srl-jax[plots]'")
     arms, notes = read(roots, key, force=values["force"].value)

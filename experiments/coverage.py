@@ -18,6 +18,7 @@ from srl_jax.files import display
 from srl_jax.specs import Info
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .reporting import texts
 from .runs import populations
 
@@ -250,7 +251,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
 def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
-    out = config_flags.check_place("out", FLAGS.out) if FLAGS.out else None
+    out = paths.check_place("out", FLAGS.out) if FLAGS.out else None
     found = table(FLAGS.experiments, sources())
     display.result("\n".join(lines(found)))
     if out is not None:

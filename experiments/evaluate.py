@@ -1,6 +1,7 @@
 """Plays full games from a checkpoint: `python -m experiments.evaluate runs/pong --gif=pong.gif`.
 
-Prints one JSON object: the game, the checkpoint's env steps, the mean, and every return and length.
+Prints one JSON object: the game, the checkpoint's env steps, the mean, and every return and length. With
+--final these are the run's own final games, whose returns are those of its row of kind "final".
 """
 
 import functools
@@ -9,12 +10,13 @@ from collections.abc import Callable
 
 from absl import flags
 
+from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import display
 from srl_jax.specs import Info
 
 from .command_line import flags as config_flags
-from .command_line import runtime
+from .command_line import paths, runtime
 
 FLAGS = flags.FLAGS
 
@@ -29,7 +31,22 @@ def check_gif(path: str) -> None:
 
     if not plots.available():
         raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
-    config_flags.check_file("gif", path, ".gif")
+    paths.check_file("gif", path, ".gif")
+
+
+def check_final(config: Config) -> None:
+    """Whether --final stands alone, and the run has final games.
+
+    Raises:
+        ConfigError: it does not, or has none.
+    """
+    if not FLAGS.final:
+        return
+    if not config.final_games:
+        raise ConfigError(f"--final: the run in {FLAGS.run} has no final games; give --games=100, say")
+    for name in ("games", "envs", "seed", "epsilon"):
+        if FLAGS[name].present:
+            raise ConfigError(f"--{name}={FLAGS[name].value}: given beside --final, which has the run's own")
 
 
 def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> None:
@@ -46,11 +63,12 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     if FLAGS.gif:
         check_gif(FLAGS.gif)
     from srl_jax.files import checkpoint
-    from srl_jax.modes import MODES
+    from srl_jax.learning.modes import MODES
 
     config = checkpoint.read_manifest(FLAGS.run).config
     if not MODES[config.mode].rl:
         raise ConfigError(f"--run={FLAGS.run}: a run of --mode={config.mode} has no policy to play with")
+    check_final(config)
     if prepare is not None:
         prepare(FLAGS.tune_runtime, config.encoder)
 
@@ -59,13 +77,16 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     import jax
 
     from srl_jax import loading
-    from srl_jax.run import actor
+    from srl_jax.run import actor, evaluations
     from srl_jax.run.evaluate import evaluate
 
     loaded = loading.load(FLAGS.run, imports=FLAGS["import"].value)
-    policy, manifest = loaded.policy(jax.random.key(FLAGS.seed)), loaded.manifest
-    number = min(FLAGS.games, config.num_envs)
-    env = actor.make_env(config, "eval", number, seed=FLAGS.seed)
+    manifest, seed = loaded.manifest, FLAGS.seed
+    games, at_once, key = FLAGS.games, FLAGS.envs or config.eval_envs or config.num_envs, jax.random.key(seed)
+    if FLAGS.final:
+        games, at_once, seed, key = evaluations.games(config, evaluations.FINAL, manifest.env_steps)
+    policy = loaded.policy(key)
+    env = actor.make_env(config, "eval", min(games, at_once), seed=seed)
     if manifest.num_actions != env.single_action_space.n:
         raise ConfigError(
             f"{manifest.path}: its policy has {manifest.num_actions} actions, {config.game} has "
@@ -76,8 +97,8 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     played = evaluate(
         policy,
         env,
-        games=FLAGS.games,
-        seed=FLAGS.seed,
+        games=games,
+        seed=seed,
         epsilon=config.eps_eval if FLAGS.epsilon is None else FLAGS.epsilon,
         stack=config.frame_stack,
         max_steps=config.eval_max_steps,
@@ -102,6 +123,9 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", flag_values=values)
     games = Info(int, "full games to play", minimum=1, maximum=1_000_000)
     config_flags.define("games", games, 10, values)
+    envs = Info(int, "environments that play at once; 0: the run's eval_envs", "environments", minimum=0)
+    config_flags.define("envs", envs, 0, values)
+    flags.DEFINE_boolean("final", False, "play the run's own final games, again", flag_values=values)
     seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
     config_flags.define("seed", seed, 0, values)
     epsilon = "probability of a random action; the run's eps_eval if not given"

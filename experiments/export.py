@@ -12,7 +12,7 @@ from absl import flags
 from srl_jax.errors import ConfigError
 
 from .command_line import flags as config_flags
-from .command_line import runtime
+from .command_line import paths, runtime
 
 FLAGS = flags.FLAGS
 
@@ -24,7 +24,7 @@ def main(argv: list[str]) -> None:
         raise ConfigError("--run: missing; name a run directory or a checkpoint, srl-jax export runs/NAME")
     if not FLAGS.encoder:
         raise ConfigError("--encoder: missing; name the file to write, --encoder=enc.npz")
-    path = config_flags.check_file("encoder", FLAGS.encoder, ".npz", overwrite=FLAGS.overwrite)
+    path = paths.check_file("encoder", FLAGS.encoder, ".npz", overwrite=FLAGS.overwrite)
     runtime.check_device()
 
     from srl_jax import encoders, loading

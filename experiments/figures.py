@@ -33,11 +33,12 @@ from srl_jax.specs import choices_text
 from . import packing
 from .arms import FIGURES, SCORES, Figure, figures_named
 from .command_line import flags as config_flags
+from .command_line import paths
 from .drawing import dots, plots
 from .drawing.colours import styles
 from .reporting import score_table
 from .runs import collect, scores
-from .runs.collect import RunData, comparable, steps_and_returns
+from .runs.collect import FINAL, RunData, comparable, steps_and_returns, steps_and_values
 from .runs.json_values import limits, plain
 from .sweeping import launching, manifest, options, probe, status
 from .sweeping.plan import Arm, Planned, parse_seeds, plan
@@ -127,6 +128,11 @@ def evaluated(
             values |= {
                 of: limits(statistics.estimate(statistics.mean, {game: x})) for of, x in ends[name].items()
             }
+            final = [steps_and_values(run, FINAL)[1] for run in members[name]]
+            if all(len(x) for x in final):  # the games after the last env step
+                last = np.array([x[-1] for x in final])
+                interval = limits(statistics.estimate(statistics.mean, {game: last}))
+                values["final"] = interval | {"games": members[name][0].config.final_games}
             if name != names[0] and names[0] in found:
                 values["against_baseline"] = _against(game, ends[name], ends[names[0]])
             entry["arms"][name] = values
@@ -274,7 +280,7 @@ def run(values: flags.FlagValues) -> int:
         raise ConfigError(f"--presets: only --figure={SCORES} takes it; a JSON file names arms of your own")
     figures = figures_named(values["figure"].value, matching(values["presets"].value) if of_scores else ())
     out = values["out"].value
-    root = config_flags.check_place("out", out)
+    root = paths.check_place("out", out)
     if packing.is_packed(root) and not values["redraw"].value:
         raise ConfigError(
             f"--out={out}: its runs are packed; draw them with --redraw, or name another directory"

@@ -28,6 +28,7 @@ from srl_jax.run import ending
 from srl_jax.run.ending import Ending
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .runs.run_data import RunData, check_rows, in_order, load_run, run_directories, runs_below
 
 FLAGS = flags.FLAGS
@@ -163,11 +164,11 @@ def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
     here = read(folder) if is_packed(folder) else []
-    whole = added([], (run for run in found if _is_over(run)))
+    whole = added([], (run for run in found if run.over))
     runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
-    return len(runs) - len(here), len(runs), [run.path for run in found if not _is_over(run)]
+    return len(runs) - len(here), len(runs), [run.path for run in found if not run.over]
 
 
 def unpack(folder: Path, root: Path) -> int:
@@ -194,11 +195,6 @@ def unpack(folder: Path, root: Path) -> int:
         if run.ended is not None:
             ending.write(path, run.ended)
     return len(runs)
-
-
-def _is_over(run: RunData) -> bool:
-    """Whether a run says how it ended, or has all its env steps: earlier versions wrote no ended.json."""
-    return run.ended is not None or bool(run.rows) and run.rows[-1]["env_steps"] >= run.config.steps
 
 
 def _name(game: str, arm: str, seed: int) -> str:
@@ -276,7 +272,7 @@ def main(argv: list[str]) -> None:
     for name in ("runs", "out"):
         if not FLAGS[name].value:
             raise ConfigError(f"--{name}: missing; name a directory")
-    runs, out = Path(os.path.expanduser(FLAGS.runs)), config_flags.check_place("out", FLAGS.out)
+    runs, out = Path(os.path.expanduser(FLAGS.runs)), paths.check_place("out", FLAGS.out)
     if not runs.is_dir():
         raise ConfigError(f"--runs={FLAGS.runs}: no such directory")
     try:

@@ -6,11 +6,14 @@ after the other: `PIECES`, or presets. The thesis is Guberina & Desta, 2022; its
 their names here.
 """
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
 from srl_jax.errors import ConfigError
 from srl_jax.specs import choices_text, join, split
+
+from .protocols import PROTOCOLS, PROTOCOLS_HELP
 
 _RECONSTRUCTION = "reconstruction:weight=1"
 _FORWARD = "forward_pixels:weight=1"
@@ -71,8 +74,9 @@ _SHORT = {
 }
 
 # Atari 100k: 100,000 decisions with one environment, as published codes have it; docs/atari100k.md has where
-# each value comes from. The evaluations are a learning curve; the published score is of 100 games at the end.
+# each value comes from, and protocols.py how it is evaluated.
 _100K = {
+    **PROTOCOLS["dopamine_100k"],
     "mode": "rl_only",
     "game": "Pong",
     "steps": 100_000,
@@ -84,26 +88,25 @@ _100K = {
     "lr_rl": 1e-4,
     "lr_srl": 1e-4,
     "adam_eps": 1.5e-4,
-    "beta_anneal_steps": 100_000,
     "eps_train": 0.0,
     "eps_final": 0.0,
-    "eps_anneal_steps": 1,
-    "eps_eval": 0.001,
     "eval_every": 10_000,
-    "noop_max": 31,
+    "eval_envs": 32,
 }
 _DER = {
     **_100K,
     "encoder": "der",
     "rl": "rainbow:n_step=20,noisy_std=0.1,hidden=256",
     "max_grad_norm": 10.0,
+    "beta_anneal_steps": 100_000,
     "slow_update_every": 2_000,
 }
 _VIEW = {"rl_view": "shift+intensity", "srl_view": "shift+intensity"}
 _JOINT_100K = {"mode": "joint", "encoder_optimizer": "summed"}
 _DOPAMINE = {**_100K, "encoder": "nature:padding=same,init=xavier", "beta": 0.5, "beta_final": 0.5}
 _DRQ = {
-    **_DOPAMINE,
+    **_100K,
+    "encoder": _DOPAMINE["encoder"],
     "rl": "drq:n_step=10,shared_hidden=true,slow=none,copies=1,target_copies=1,view=shift+intensity",
     "eps_train": 1.0,
     "eps_final": 0.1,
@@ -119,11 +122,13 @@ _OF_SPR = {
 }
 _SPR = {
     **_100K,
+    **PROTOCOLS["spr_100k"],
     **_OF_SPR,
     "encoder": "nature:end=min_max",
     "rl": "rainbow:n_step=10,noisy_std=0.5,hidden=256,priority=kl,slow=none",
     "eps_train": 1.0,
     "eps_anneal_steps": 2_000,
+    "beta_anneal_steps": 100_000,
     "max_grad_norm": 10.0,
 }
 _SPR_JAX = {
@@ -183,7 +188,7 @@ _ATARI100K: dict[str, dict[str, Any]] = {
         "shrink": 0.5,
     },
     "a_lix": {
-        **_DER,
+        **{name: value for name, value in _DER.items() if name != "slow_update_every"},
         "encoder": "a_lix:lix=1",
         "rl": "rainbow:n_step=3,noisy_std=0.1,hidden=256,slow=none",
         "updates_per_step": 2,
@@ -272,10 +277,15 @@ def _textbook(values: dict[str, Any]) -> dict[str, Any]:
     return {**values, **own}
 
 
+def _over(own: Mapping[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    return {**values, **own}
+
+
 PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "small": _small,
     "textbook": _textbook,
-    "aug": lambda values: {**values, **_AUG},
+    "aug": functools.partial(_over, _AUG),
+    **{f"protocol/{name}": functools.partial(_over, own) for name, own in PROTOCOLS.items()},
 }
 """What may stand behind a preset and a +: functions of its settings."""
 
@@ -283,6 +293,7 @@ PIECES_HELP = {
     "small": "at the size of Catch, minutes a run",
     "textbook": "without the five choices that the thesis' presets make beside the textbook's agent",
     "aug": "with random shift of all frames",
+    **{f"protocol/{name}": text for name, text in PROTOCOLS_HELP.items()},
 }
 
 PRESETS: dict[str, dict[str, Any]] = {

@@ -16,7 +16,6 @@ import functools
 import io
 import os
 import sys
-import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -28,10 +27,11 @@ from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.files.display import Progress, hms
+from srl_jax.files.display import Progress
 from srl_jax.specs import Info, choices_text, value_text
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .command_line.stopping import signals
 from .train import check_extras
 
@@ -56,22 +56,12 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
         ConfigError: the policy is no-op, and the game has no such action.
     """
     from srl_jax.run.actor import make_env, random_policy, seed_for
-    from srl_jax.run.evaluate import evaluate
+    from srl_jax.run.evaluate import evaluate, telling
 
     seed = functools.partial(seed_for, config.seed, "reference policy", policy)
     number = min(episodes, MOST_ENVS)
     env = make_env(config, "eval", number, seed=seed("environments"))
     with contextlib.closing(env), Progress(episodes, "games") as progress:
-        began = time.monotonic()
-
-        def told(steps: int, games: int) -> None:
-            seconds = time.monotonic() - began
-            # Until games have ended nobody knows how long they are, only how long they can be.
-            known = steps < 50 or games == episodes or number < episodes
-            at_most = None if known else f"{hms(seconds / steps * (config.eval_max_steps - steps))} left"
-            fields = {"env steps": f"{steps * number:,}", "steps/s": f"{steps * number / seconds:,.0f}"}
-            progress.update(games, **fields, **{"at most": at_most})
-
         progress.note(f"{config.game}, {policy} policy, {episodes:,} games")
         act = random_policy(int(env.single_action_space.n), np.random.default_rng(seed("actions")))
         if policy == "no-op":
@@ -88,7 +78,7 @@ def play(policy: str, config: Config, episodes: int, stop=lambda: False) -> Refe
             stack=1,
             max_steps=config.eval_max_steps,
             stop=stop,
-            told=told,
+            told=telling(progress, episodes, number, config.eval_max_steps),
         )
     if played is None:
         return None
@@ -217,7 +207,7 @@ def run(values: flags.FlagValues) -> int:
 
 
 def _check_out(text: str) -> Path:
-    config_flags.check_name("out", text)
+    paths.check_name("out", text)
     path = Path(os.path.expanduser(text))
     if path.suffix.lower() != ".csv":
         raise ConfigError(f"--out={text}: must end in .csv")

@@ -10,7 +10,6 @@ Several directories are compared with each other:
 import functools
 import importlib.util
 import math
-import os
 from pathlib import Path
 
 from absl import flags
@@ -19,6 +18,7 @@ from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files.reading import replace_text
 
 from .command_line import flags as config_flags
+from .command_line import paths
 
 FLAGS = flags.FLAGS
 NEEDED = {"jinja2": "Jinja2", "markdown_it": "markdown-it-py", "matplotlib": "matplotlib", "PIL": "Pillow"}
@@ -41,30 +41,6 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     yes("force", False, "compare runs with different protocols")
     yes("finished_only", False, "compare only runs that have ended")
     yes("media", True, "show the runs' own pictures")
-
-
-def check_out(out: str | None, *, overwrite: bool) -> Path:
-    """Whether the page, and the table beside it, can be written there; writes nothing.
-
-    Raises:
-        ConfigError: it cannot, or there is a file that must not be overwritten.
-    """
-    if not out:
-        raise ConfigError("--out: missing; name the page to write, --out=report.html")
-    if Path(out).suffix.lower() not in (".html", ".htm"):
-        raise ConfigError(f"--out={out}: must end in .html")
-    config_flags.check_name("out", out)
-    path = Path(os.path.expanduser(out))
-    config_flags.check_place("out", str(path.parent))
-    try:
-        for file in (path, path.with_suffix(".csv")):
-            if file.is_dir():
-                raise ConfigError(f"--out={out}: {file} is a directory")
-            if os.path.lexists(file) and not overwrite:
-                raise ConfigError(f"--out={out}: {file} exists; name a new file, or --overwrite replaces it")
-    except OSError as error:
-        raise ConfigError(f"--out={out}: {error.strerror}") from None
-    return path
 
 
 def check_reach(texts: list[str]) -> dict[str, float]:
@@ -101,7 +77,11 @@ def report(values: flags.FlagValues) -> Path:
     runs = values["runs"].value
     if not runs:
         raise ConfigError("--runs: missing; name a directory of runs, srl-jax report runs")
-    path = check_out(values["out"].value, overwrite=values["overwrite"].value)
+    if not (out := values["out"].value):
+        raise ConfigError("--out: missing; name the page to write, --out=report.html")
+    path = paths.check_file(
+        "out", out, ".html", ".htm", overwrite=values["overwrite"].value, beside=".csv", deep=True
+    )
     reach = check_reach(values["reach"].value)
     for root in runs:
         if not Path(root).is_dir():

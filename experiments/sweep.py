@@ -21,6 +21,7 @@ from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display, rundir
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .runs import collect
 from .sweeping import launching, manifest, options, plan, states, status
 from .sweeping.plan import Planned
@@ -91,7 +92,7 @@ def main(argv: list[str]) -> int:
     del argv
     if not FLAGS.out:
         raise ConfigError("--out: missing; name a directory for the sweep, --out=runs/NAME")
-    root = config_flags.check_place("out", FLAGS.out)
+    root = paths.check_place("out", FLAGS.out)
     how = options.launcher_options(FLAGS)
     workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
     if FLAGS.status:

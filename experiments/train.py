@@ -19,12 +19,12 @@ from srl_jax import envs
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
-from srl_jax.files.resuming import all_to_resume, blank, going_on, is_run, say_anew
+from srl_jax.files.resuming import all_to_resume, blank, going_on, has_ended, is_run, say_anew
 from srl_jax.files.rundir import check_free, run_directory
 from srl_jax.training import check_game, check_sources, completed, resolved
 
 from .command_line import flags as config_flags
-from .command_line import runtime
+from .command_line import paths, runtime
 from .command_line.stopping import signals
 
 FLAGS = flags.FLAGS
@@ -80,7 +80,7 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
         raise ConfigError("--out: missing; name a directory for the run, --out=runs/NAME")
     if overwrite and resume:
         raise ConfigError("--resume=auto: resumes the run that --overwrite deletes; give one of them")
-    path = config_flags.check_place("out", out)
+    path = paths.check_place("out", out)
     try:
         problem = "" if blank(path) else _why_not(path, config, overwrite, resume)
     except OSError as error:
@@ -141,8 +141,10 @@ def check_extras(config: Config) -> None:
 
 def say_unused(values: flags.FlagValues, game: str) -> None:
     """A line for each flag that was given and that the game's environments have no use for."""
-    for name in ("sticky_actions", "noop_max"):
-        if values[name].present and name not in envs.game(game).options:
+    row = envs.game(game)
+    has = {name: name in row.options for name in ("sticky_actions", "full_actions", "noop_max")}
+    for name, known in (has | {"life_loss": row.lives}).items():
+        if values[name].present and not known:
             display.say(f"--{name}: changes nothing, {game} has none")
 
 
@@ -181,7 +183,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     config = config_flags.config_from_flags(values, complete=not values["print_config"].value)
     if values["print_config"].value:
         config_flags.say_what_is_replaced(values)
-        display.result(resolved(config).to_json())
+        display.result(resolved(config, config_flags.what_is_given(values)).to_json())
         return 0
     seeds = check_seeds(values)
     resume = values["resume"].value == "auto"
@@ -195,16 +197,15 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     if prepare is not None and not dry:
         prepare(values["tune_runtime"].value, config.encoder)
     runtime.check_device()
-    config = resolved(config)
+    config = resolved(config, config_flags.what_is_given(values))
 
-    from srl_jax.files import checkpoint
     from srl_jax.run import loop
     from srl_jax.run.schedules import printed
 
     runs = [(path / f"seed{seed}", dataclasses.replace(config, seed=seed)) for seed in seeds]
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs, completed) if resume else [None] * len(runs)
-    if all(m and (checkpoint.NUMBERS not in m.files or m.env_steps >= config.steps) for m in manifests):
+    if all(m and has_ended(where, m, c) for (where, c), m in zip(runs, manifests, strict=True)):
         print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
         return 0
     # A checkpoint has the encoder; the policy that others are pretrained on is read again.

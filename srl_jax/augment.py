@@ -89,6 +89,11 @@ def _make_row_view(parts: str) -> Callable[[Array, Array], Array]:
     """view: (frames [T, H, W, C], key) -> frames, of one row; `parts` as of `make_view`."""
     names = [] if parts == "none" else parts.split("+")
     for name in names:
+        if name.endswith(EACH):
+            raise ValueError(
+                f"{EACH} ends a view, and --rl_view, --srl_view and --target_view alone take it; give "
+                f"{parts.replace(EACH, '')}"
+            )
         if name not in VIEWS:
             raise ValueError(f"no view {name!r}; {choices_text(name, [*VIEWS, 'none'])}, or several with +")
 

@@ -7,14 +7,15 @@ code. An "env step" is one decision of the agent, which is four emulator frames 
 
 import dataclasses
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from srl_jax import annealing, envs, modes, specs
+from srl_jax import checks, envs, specs
 from srl_jax.errors import ConfigError
 from srl_jax.files import provenance
 from srl_jax.files.reading import parse_json, read_json, replace_text
+from srl_jax.learning import annealing, modes
 from srl_jax.specs import Info
 
 SOURCES = ("encoder_from", "policy_from")
@@ -194,6 +195,14 @@ class Config:
         int, 27_000, "length at which an evaluation game is cut (27,000 are 108,000 frames)", "env steps",
         minimum=1, maximum=specs.LIMITS[int] // envs.FRAME_SKIP,
     )  # fmt: skip
+    final_games: int = _value(
+        int, 0, "full games after the last env step, in a row of kind final; 0: none", "games",
+        minimum=0, maximum=1_000_000,
+    )  # fmt: skip
+    eval_envs: int = _value(
+        int, 0, "environments that play an evaluation's games at once, one game or more each; 0: --num_envs",
+        "environments", minimum=0, maximum=10_000,
+    )  # fmt: skip
     stop_at_return: float | None = _value(
         float, None, "mean evaluation return at which the run ends early, or off", "unclipped score",
         optional=True,
@@ -227,23 +236,19 @@ class Config:
     reward_clip: bool = _value(bool, True, "learn from the sign of the reward")
     life_loss: bool = _value(bool, True, "a lost life ends the return, but not the game, in training")
     sticky_actions: float = _share(0.0, "the emulator repeats the last action with this probability")
-    noop_max: int = _value(
-        int,
-        30,
-        "a game starts with fewer random no-ops than this",
-        "emulator frames",
-        minimum=0,
-        maximum=1_000,
+    full_actions: bool = _value(
+        bool, False, "all 18 actions of the joystick, instead of those that the game knows (Atari)"
     )
+    noop_max: int = _value(
+        int, 30, "a game starts with fewer random no-ops than this", "emulator frames",
+        minimum=0, maximum=1_000,
+    )  # fmt: skip
     frame_size: int = _value(
-        int,
-        84,
+        int, 84,
         "height and width that frames are resized to; 0: as large as the gymnasium environment's own; Catch "
         "has 42 and 84",
-        "pixels",
-        minimum=0,
-        maximum=1_024,
-    )
+        "pixels", minimum=0, maximum=1_024,
+    )  # fmt: skip
     frame_stack: int = _value(int, 4, "frames in one observation", "frames", minimum=1, maximum=256)
 
     encoder_from: str = _value(str, "", "run directory or checkpoint whose encoder this run starts from")
@@ -375,32 +380,45 @@ def resolve(
     rl_registry: Mapping[str, Callable],
     encoder_registry: Mapping[str, Callable],
     objective_registry: Mapping[str, Callable],
+    given: Collection[str] = (),
 ) -> Config:
     """Writes out everything that the config leaves to a default: all options, rates and intervals.
 
-    A game gets its canonical name, see `srl_jax.envs.canonical`.
+    A game gets its canonical name, see `srl_jax.envs.canonical`, and what nothing reads its default.
+
+    Args:
+        config: a run's.
+        rl_registry, encoder_registry, objective_registry: name -> factory.
+        given: fields and options that were given and have to be read.
 
     Returns:
         A Config that resolves to itself; what config.json holds.
 
     Raises:
-        ConfigError: a specification is not valid; one line that names the flag.
+        ConfigError: a specification is not valid, or nothing reads what was given; names the flag.
     """
     rl = specs.parse(config.rl, rl_registry, "rl")
     encoder = specs.parse(config.encoder, encoder_registry, "encoder")
-    objectives = [specs.parse(text, objective_registry, "objective") for text in config.objectives]
+    objectives = tuple(specs.parse(text, objective_registry, "objective") for text in config.objectives)
+    for objective in objectives:
+        if [other.name for other in objectives].count(objective.name) > 1:
+            raise ConfigError(f"--objective={objective}: {objective.name} is given twice")
+    run = checks.run_of(config, rl=rl, objectives=objectives)
+    run.refuse(given)
+    config = run.in_force()
+    rl = specs.parse(config.rl, rl_registry, "rl")  # where RL is not trained, the default
+    run = run._replace(config=config, rl=rl)
+    rl, encoder, *terms = (run.spec_in_force(spec, given) for spec in (rl, encoder, *objectives))
     if config.n_anneal:
         annealing.check_n(config.n_anneal, rl)
-    names = [objective.name for objective in objectives]
-    for objective in objectives:
-        if names.count(objective.name) > 1:
-            raise ConfigError(f"--objective={objective}: {objective.name} is given twice")
     return dataclasses.replace(
         config,
         game=envs.canonical(config.game),
         rl=rl.full,
         encoder=encoder.full,
-        objectives=tuple(objective.full for objective in objectives),
+        objectives=tuple(term.full for term in terms),
+        n_anneal=annealing.written(config.n_anneal, int),
+        gamma_anneal=annealing.written(config.gamma_anneal, float),
         lr_encoder=modes.encoder_learning_rate(config),
         lr_encoder_srl=modes.second_learning_rate(config),
         checkpoint_every=config.checkpoint_every or config.eval_every,
@@ -424,14 +442,3 @@ def difference(there: Config, here: Config, names: Iterable[str] = tuple(INFOS))
     """What differs of these fields, `steps is 1000 there and 2000 here, ...`; "" if nothing."""
     pairs = ((name, getattr(there, name), getattr(here, name)) for name in names)
     return ", ".join(f"{name} is {a} there and {b} here" for name, a, b in pairs if a != b)
-
-
-MAY_CHANGE = ("steps", "stop_at_return", "keep_replay", "keep_best", "imports", "loggers")
-"""Fields that may change when a run is resumed: when it ends, what it leaves, its plug-ins and loggers."""
-
-
-def another_run(there: Config, here: Config) -> str:
-    """`difference` of what makes two runs two: neither `MAY_CHANGE` nor where the sources lie by now."""
-    same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
-    same |= {name: getattr(there, name) for name in MAY_CHANGE}
-    return difference(there, dataclasses.replace(here, **same))

@@ -9,14 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from srl_jax import plugins
-from srl_jax.agent import Agent, make_agent
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
-from srl_jax.optim import ENCODER, RL
+from srl_jax.learning.agent import Agent, make_agent
+from srl_jax.learning.optim import ENCODER, RL
+from srl_jax.learning.update import epsilon_greedy
 from srl_jax.run.actor import Policy
 from srl_jax.types import Array, Encoder, Params
-from srl_jax.update import epsilon_greedy
 
 
 class Loaded:
@@ -27,7 +27,7 @@ class Loaded:
     number of observations. To differentiate, take `encoder.apply(params["encoder"], observations)`.
 
     Attributes:
-        agent: what the configuration means, `srl_jax.agent.Agent`.
+        agent: what the configuration means, `srl_jax.learning.agent.Agent`.
         params: {"encoder": tree, OBJECTIVE: its head's tree}, what the checkpoint holds; RL's is "rl".
         manifest: of the checkpoint.
         config: of the run, resolved.

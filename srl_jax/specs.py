@@ -7,6 +7,7 @@ type. So a new option needs no new flag, and a typo is answered with a list of w
 
 import dataclasses
 import difflib
+import functools
 import inspect
 import math
 import re
@@ -41,12 +42,16 @@ class Spec:
         options: the options that were given, by name, of their default's type.
         resolved: every option of the row, the defaults included, in the factory's order.
         flag: where it came from, without dashes; names the flag in errors. May be empty.
+        needs: {option: what it needs beside it}, see `srl_jax.needs`.
+        defaults: of all options.
     """
 
     name: str
     options: Mapping[str, Any]
     resolved: Mapping[str, Any]
     flag: str = dataclasses.field(default="", compare=False)
+    needs: Mapping[str, str] = dataclasses.field(default_factory=dict, compare=False)
+    defaults: Mapping[str, Any] = dataclasses.field(default_factory=dict, compare=False)
 
     def __str__(self) -> str:
         """The given options in the factory's order; parsing it gives this Spec again."""
@@ -56,6 +61,21 @@ class Spec:
     def full(self) -> str:
         """Like str, with every option: config.json keeps it, so no later default changes a run."""
         return join(self.name, self.resolved)
+
+    @property
+    def changed(self) -> list[str]:
+        """The options whose value is not the default."""
+        return [name for name, value in self.resolved.items() if value != self.defaults[name]]
+
+    @property
+    def where(self) -> str:
+        """What begins an error about it."""
+        return _where(self.flag, str(self))
+
+    def without(self, names: Iterable[str]) -> "Spec":
+        """The same with the defaults of these options."""
+        options = {name: value for name, value in self.options.items() if name not in [*names]}
+        return dataclasses.replace(self, options=options, resolved={**self.defaults, **options})
 
 
 def choices_text(given: str, names: Iterable[str]) -> str:
@@ -126,7 +146,7 @@ class Weight(float):
         final: where it goes to, linearly, and then stays.
         steps: env steps until it is there; 0 where it does not change.
         ratio: whether it is the share of RL's gradient on the encoder that the objective's is held at, see
-            `srl_jax.weights`, and not a factor of the loss.
+            `srl_jax.learning.weights`, and not a factor of the loss.
     """
 
     final: float
@@ -322,6 +342,23 @@ def overlaid(base: str, text: str) -> str:
     return join(name, options | split(name + text.lstrip())[1])
 
 
+def needs(**options: str) -> Callable[[Callable], Callable]:
+    """Says above a factory what its options need: `@needs(tau="target=slow")`, see `srl_jax.needs`."""
+
+    def declared(factory: Callable) -> Callable:
+        factory.__dict__["needs"] = options
+        return factory
+
+    return declared
+
+
+def needs_of(factory: Callable) -> dict[str, str]:
+    """{option: what it needs} of a factory, or of a functools.partial of one."""
+    while isinstance(factory, functools.partial):
+        factory = factory.func
+    return getattr(factory, "__dict__", {}).get("needs", {})
+
+
 def option_defaults(factory: Callable) -> dict[str, Any]:
     """The options of a factory: its keyword-only parameters with their defaults, in order.
 
@@ -384,7 +421,7 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
             except ValueError as error:
                 raise SpecError(f"{where}: {key}={value} {error}") from None
     options = {key: options[key] for key in defaults if key in options}
-    return Spec(name, options, {**defaults, **options}, flag)
+    return Spec(name, options, {**defaults, **options}, flag, needs_of(registry[name]), defaults)
 
 
 def build(spec: Spec, registry: Mapping[str, Callable], *context: Any) -> Any:
@@ -399,7 +436,7 @@ def build(spec: Spec, registry: Mapping[str, Callable], *context: Any) -> Any:
         raise
     except ValueError as error:
         reason = " ".join(str(error).split())
-        raise SpecError(f"{_where(spec.flag, str(spec))}: {reason}") from error
+        raise SpecError(f"{spec.where}: {reason}") from error
 
 
 def _where(flag: str, text: str) -> str:

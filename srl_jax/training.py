@@ -1,17 +1,20 @@
 """Training as one call, and the checks that come before. Imports no jax until they need it."""
 
 import os
+from collections.abc import Collection, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from srl_jax import envs, modes, plugins
+from srl_jax import checks, envs, plugins, specs
 from srl_jax.config import Config, resolve
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.rundir import run_directory
+from srl_jax.needs import EVERYTHING
 
 if TYPE_CHECKING:
     from srl_jax.run.loop import Result
+    from srl_jax.types import Objective
 
 
 def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True) -> "Result":
@@ -43,9 +46,9 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
         raise ConfigError(f"{path}: {error.strerror}") from None
     if taken:
         raise ConfigError(f"{path}: not an empty directory; name a new one (srl-jax resume resumes a run)")
-    modes.check(config)
+    config = checks.check(config)
     check_game(config)
-    full = resolved(config)
+    full = resolved(config, EVERYTHING)
     check_sources(full)
 
     from srl_jax.run import loop
@@ -72,39 +75,72 @@ def check_game(config: Config, imported: bool = False) -> None:
         raise ConfigError(f"--game={config.game}: {error}") from None
 
 
-def resolved(config: Config) -> Config:
+def resolved(config: Config, given: Collection[str] = ()) -> Config:
     """`srl_jax.config.resolve` with the registries and what --import adds, and a trial build; imports jax.
+
+    Args:
+        config: a run's.
+        given: fields and options that were given and have to be read, see `srl_jax.needs.Run.refuse`.
 
     Raises:
         ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
-            these frames, or there is no such view, or a logger's package is missing.
+            these frames, or there is no such view, or a logger's package is missing, or nothing reads what
+            was given.
     """
-    from srl_jax.agent import components
     from srl_jax.augment import Views
     from srl_jax.files import loggers
+    from srl_jax.learning.agent import components
 
     if config.imports:
         plugins.load(config.imports)
         check_game(config, imported=True)
     loggers.check(config.loggers)
-    full = completed(config)
+    full = completed(config, given)
     # Options may be valid one by one and not together, or not for these frames: only a factory knows. An
     # environment's own size and its number of actions are known once it is made; any will do for that.
     size = config.frame_size or 84
-    components(config, (size, size, 1), num_actions=18)
+    _, _, terms = components(config, (size, size, 1), num_actions=18)
     Views.of(config)
+    checks.run_of(full, **built(full, terms)).refuse(given)
     return full
 
 
-def completed(config: Config) -> Config:
+def built(config: Config, terms: Mapping[str, "Objective"]) -> dict[str, Any]:
+    """What of `srl_jax.needs.Run` takes the registries, and the objectives of a configuration."""
+    import jax
+
+    from srl_jax import objectives, rl
+
+    key = jax.random.key(0)
+    return {
+        "rl": specs.parse(config.rl, rl.REGISTRY, "rl"),
+        "objectives": tuple(
+            specs.parse(text, objectives.REGISTRY, "objective") for text in config.objectives
+        ),
+        "terms": terms,
+        "heads": any(jax.tree.leaves(jax.eval_shape(term.init, key)) for term in terms.values()),
+    }
+
+
+def completed(config: Config, given: Collection[str] = ()) -> Config:
     """`srl_jax.config.resolve` with the registries as they are: what is imported is known; imports jax."""
     from srl_jax import encoders, objectives, rl
 
-    return resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY)
+    return resolve(config, rl.REGISTRY, encoders.REGISTRY, objectives.REGISTRY, given)
 
 
 _SAME = {"encoder_from": "encoder", "policy_from": "game"}
 """What a run must have in common with the one that a flag names, beside how frames are made."""
+
+
+def _written_out(encoder: str) -> str:
+    """A specification with the options that the encoder has by now; as it is where it is none."""
+    from srl_jax import encoders
+
+    try:
+        return specs.parse(encoder, encoders.REGISTRY, "encoder").full
+    except ConfigError:
+        return encoder
 
 
 def check_sources(config: Config) -> None:
@@ -127,7 +163,7 @@ def check_sources(config: Config) -> None:
         for field in (own, "frame_size", "frame_stack"):
             what = {"encoder": "architecture", "game": "game"}.get(field, "preprocessing")
             ours, theirs = getattr(config, field), getattr(found, field)
-            if ours != theirs:
+            if ours != theirs and (field != "encoder" or _written_out(ours) != _written_out(theirs)):
                 raise ConfigError(
                     f"--{flag}={path}: the {what} differs: {field} is {theirs} there and {ours} here"
                 )

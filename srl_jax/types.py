@@ -205,8 +205,8 @@ class Objective(NamedTuple):
         reads: {group: its tree -> a part of it}: parameters of other groups that the loss and the image
             compute with. Heads, slow ones too, have each part under the name of its group, beside their own
             parameters, a dict then. Where the mode lets the objective train the encoder, its gradient flows
-            into what it reads, whose group an optimizer moves as `srl_jax.update.passes` says; elsewhere none
-            does.
+            into what it reads, whose group an optimizer moves as `srl_jax.learning.update.passes` says;
+            elsewhere none does.
     """
 
     init: Callable[[jax.Array], Params]
@@ -239,7 +239,7 @@ class TrainState(NamedTuple):
             "rl_srl" where an objective with an Adam of its own for the encoder reads RL's head.
         step: int32, updates done.
         key: the run's key; update i uses fold_in(key, i), so it never changes.
-        norms: running means of norms, see `srl_jax.weights`; None where no weight is a ratio.
+        norms: running means of norms, see `srl_jax.learning.weights`; None where no weight is a ratio.
     """
 
     params: Params

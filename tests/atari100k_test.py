@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from experiments.presets import PRESETS, preset_values
+from experiments.protocols import PROTOCOLS
 from srl_jax import encoders, objectives, rl, specs
 from srl_jax.config import Config, resolve
 from srl_jax.specs import split, value_text
@@ -49,6 +50,10 @@ def test_presets_are_what_the_table_says(name):
         values |= {kind: own} | {f"{kind} {option}": text for option, text in options.items()}
     for own, options in map(split, config.objectives):
         values |= {f"{own} {option}": text for option, text in options.items()}
+    if (protocol := TABLE[name]["protocol"]) != "-":
+        own = PROTOCOLS[protocol]
+        assert all(getattr(config, field) == x for field, x in own.items() if field != "eps_eval")
+    values["protocol"] = protocol
     values["objective"] = " + ".join(split(text)[0] for text in config.objectives) or "-"
     for setting, wanted in TABLE[name].items():
         if wanted != "-":

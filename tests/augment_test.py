@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax.augment import random_shift
+from srl_jax.augment import make_view, random_shift
 from tests.helpers import jit
 
 
@@ -46,6 +46,13 @@ def test_every_draw_is_one_shift_of_the_whole_sequence_and_all_shifts_come_up(dt
     counts = [found.count(offset) for offset in names.values()]
     # Uniform: 40 expected of each, with standard deviation 6.2.
     assert min(counts) > 15 and max(counts) < 70
+
+
+@pytest.mark.parametrize("text", ["shift@each", "shift@each+intensity"])
+def test_a_draw_for_each_observation_is_of_the_views_of_a_run_alone(text):
+    plain = text.replace("@each", "").replace("+", r"\+")
+    with pytest.raises(ValueError, match=rf"^@each ends a view, and --rl_view, .* take it; give {plain}$"):
+        make_view(text)
 
 
 def test_four_pixels_is_the_default_and_none_the_identity():

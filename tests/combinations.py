@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from srl_jax import encoders, modes, objectives, rl, specs, train
+from srl_jax import checks, encoders, objectives, rl, specs, train
 from srl_jax.config import Config
 from srl_jax.encoders.options import ENDS, POOLS
 from srl_jax.envs.games import BACKGROUNDS
@@ -16,7 +16,9 @@ from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.rundir import run_directory
 from srl_jax.layers import INITIALISERS
+from srl_jax.learning import modes
 from srl_jax.run import loop
+from srl_jax.training import completed
 from tests.helpers import write_checkpoint
 from tests.soak.conftest import different, remains, rows_of
 
@@ -37,8 +39,7 @@ WEIGHTS = ("0.5", "0", "1->0.01@80", "ratio:0.1", "ratio:0.1->0.01@80")
 
 ALWAYS = {"hidden": 16, "atoms": 11, "outputs": 16, "quantiles": 8, "target_quantiles": 6}
 ALWAYS |= {"act_quantiles": 4, "cosines": 8, "v_min": -2.0, "v_max": 2.0}
-"""Options that keep networks small, wherever a row has them. Rainbow without a distribution refuses some."""
-UNREAD = ("atoms", "v_min", "v_max", "init_std", "priority")
+"""Options that keep networks small, wherever a row has them."""
 
 OPTIONS = {
     # RL
@@ -76,9 +77,7 @@ SETTINGS = {
 """{field of Config: what is drawn, one time in ten}."""
 
 NEEDED = {
-    "shared_hidden": {"dueling": True}, "munchausen": {"double": False}, "target=s_t+n-1": {"n_step": 2},
-    "copies=2": {"view": "shift"}, "target_copies=2": {"view": "shift"}, "init_std": {"init_std": 1.0},
-    "projection=rl": {"hidden": 512}, "lix_goal": {"lix": 1.0},
+    "munchausen": {"double": False}, "target=s_t+n-1": {"n_step": 2}, "init_std": {"init_std": 1.0},
 }  # fmt: skip
 """{an option, or one of its values: what it needs beside it}; refused without."""
 
@@ -128,8 +127,6 @@ def draw_spec(rng: random.Random, registry: str, row: str, factory, share: float
         option, equals, value = what.partition("=")
         if option in given and str(given[option]) == (value or str(given[option])) and rng.random() < 0.8:
             given |= needed
-    if given.get("distributional") is False and rng.random() < 0.9:
-        given = {name: x for name, x in given.items() if name not in UNREAD}
     return specs.join(row, given)
 
 
@@ -157,10 +154,6 @@ def draw(number: int, encoder: str = "") -> Draw:
     # What has to be said of both is left out now and then, and is then refused.
     if "reset" in values and rng.random() < 0.9:
         values["reset_every"] = rng.choice((64, 76, 20))
-    if values.get("reset") != "all" and rng.random() < 0.9:
-        values.pop("shrink", None)
-    if "reset" not in values and rng.random() < 0.9:
-        values.pop("reset_last", None)
     if values.get("gate") in modes.PROJECTING and rng.random() < 0.7:
         values["encoder_optimizer"] = rng.choice(("summed", "simultaneous"))
     row = rng.choice([*rl.REGISTRY])
@@ -193,14 +186,18 @@ def config_of(drawn: Draw, folder: Path) -> Config:
         ConfigError: it is no valid one.
     """
     values = SMALL | {"diagnostics": False} | drawn.values
-    config = Config(**values)
     if not drawn.source:
-        return config
+        return in_force(values)
     alike = {name: values[name] for name in ("encoder", "frame_stack", "game") if name in values}
     alike["encoder"] = specs.parse(alike["encoder"], encoders.REGISTRY, "encoder").full
-    colours = "own_environment" in config.game and "grey" not in config.game
+    colours = "own_environment" in values["game"] and "grey" not in values["game"]
     write_checkpoint(folder / "source", only=["encoder"], channels=3 if colours else 1, **alike)
-    return Config(**values, encoder_from=str(folder / "source"))
+    return in_force({**values, "encoder_from": str(folder / "source")})
+
+
+def in_force(values: dict) -> Config:
+    """A Config, with defaults for what was drawn and nothing reads; tests/needs_test.py has the refusals."""
+    return completed(checks.check(Config(**values), given=()))
 
 
 def sentence(error: ConfigError) -> str:

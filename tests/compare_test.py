@@ -64,6 +64,22 @@ def test_the_table_by_hand(runs, capsys):
     assert lines[3:] == [["lr_rl:", "1e-3,", "1e-4"]]
 
 
+def test_final_games_are_compared_where_all_have_them_and_as_many(tmp_path, capsys):
+    for seed, final in enumerate([(1, 3), (4, 6)]):
+        write_run(tmp_path / f"a/seed{seed}", seed=seed, final=final, final_games=2)
+    write_run(tmp_path / "b", final=(7, 9), final_games=2, lr_rl=1e-3)
+    _compare(tmp_path, "--key=final/return_mean")
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    # Of a, the mean of 2 and 5, and 12.706 times a standard error of 1.5 to either side.
+    a, b = ([x.strip("[],") for x in line] for line in lines[1:3])
+    assert [float(x) for x in a[2:5]] == pytest.approx([3.5, 3.5 - 19.059, 3.5 + 19.059], abs=0.01)
+    assert b[2] == "8"
+    write_run(tmp_path / "c", final=(7, 9, 8), final_games=3)
+    with pytest.raises(ConfigError, match="final_games is 2 there and 3 here; --force"):
+        _compare(tmp_path, "--key=final/return_mean")
+    _compare(tmp_path, "--key=eval/return_mean")  # their curves are alike
+
+
 def test_the_picture_has_means_intervals_and_names(runs, tmp_path, drawn):
     path = tmp_path / "ab.png"
     _compare(runs / "a", runs / "b", f"--out={path}")

@@ -1,4 +1,4 @@
-"""Tests of srl_jax.config and of srl_jax.modes, which a config is checked against."""
+"""Tests of srl_jax.config and of srl_jax.learning.modes, which a config is checked against."""
 
 import dataclasses
 import datetime
@@ -10,11 +10,12 @@ import hypothesis
 import pytest
 from hypothesis import strategies as st
 
+from srl_jax import checks
 from srl_jax import config as config_module
-from srl_jax import modes
 from srl_jax.config import INFOS, Config, difference, resolve
 from srl_jax.errors import ConfigError
 from srl_jax.files import provenance
+from srl_jax.learning import modes
 from srl_jax.specs import LIMITS
 
 
@@ -275,32 +276,38 @@ def test_a_mode_takes_the_encoder_and_the_objectives_that_it_needs(mode):
     started = dataclasses.replace(scratch, encoder_from="runs/a")
     for config, start in ((scratch, "scratch"), (started, "checkpoint")):
         if mode.encoder_start in (start, "either"):
-            modes.check(config)
+            checks.check(config)
         else:
             with pytest.raises(ConfigError, match="^--encoder_from"):
-                modes.check(config)
+                checks.check(config)
     right = scratch if mode.encoder_start != "checkpoint" else started
     wrong = dataclasses.replace(right, objectives=() if objectives else ("first",))
     with pytest.raises(ConfigError, match=f"^--objective: --mode={mode.name}"):
-        modes.check(wrong)
+        checks.check(wrong)
 
 
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"mode": "rl_only", "policy_from": "x"}, "--policy_from=x: only --mode=pretrain"),
-        ({"mode": "rl_only", "augment": "srl"}, "--augment=srl: --mode=rl_only"),
+        (
+            {"mode": "rl_only", "policy_from": "x"},
+            "--policy_from=x: nothing reads it in --mode=rl_only, which acts",
+        ),
+        ({"mode": "rl_only", "augment": "srl"}, "--augment=srl: nothing reads it in --mode=rl_only"),
         ({"mode": "frozen", "encoder_from": "x", "lr_encoder": 1.0}, "--lr_encoder=1.0"),
         (
             {"mode": "rl_only", "srl_view": "shift"},
-            "--srl_view=shift: --mode=rl_only has no",
+            "--srl_view=shift: nothing reads it in --mode=rl_only",
         ),
-        ({"mode": "pretrain", "objectives": ("a",), "rl_view": "shift"}, "--rl_view=shift: --mode=pretrain"),
+        (
+            {"mode": "pretrain", "objectives": ("a",), "rl_view": "shift"},
+            "--rl_view=shift: nothing reads it in --mode=pretrain",
+        ),
     ],
 )
 def test_settings_that_a_mode_ignores_are_refused(values, message):
     with pytest.raises(ConfigError) as error:
-        modes.check(Config(**values))
+        checks.check(Config(**values))
     assert str(error.value).startswith(message)
     assert "\n" not in str(error.value)
 
@@ -308,9 +315,9 @@ def test_settings_that_a_mode_ignores_are_refused(values, message):
 def test_an_encoder_may_be_needed_beyond_the_mode_or_not_be_asked_for():
     joint = Config(mode="joint", objectives=("first",))
     with pytest.raises(ConfigError, match="needs --encoder_from=PATH; make one$"):
-        modes.check(joint, needs_encoder=True, hint="make one")
-    modes.check(joint, needs_encoder=True, complete=False)
-    modes.check(Config(mode="frozen"), complete=False)
+        checks.check(joint, needs_encoder=True, hint="make one")
+    checks.check(joint, needs_encoder=True, complete=False)
+    checks.check(Config(mode="frozen"), complete=False)
 
 
 def test_the_difference_of_two_configurations_names_every_field():

@@ -18,11 +18,11 @@ from srl_jax.diagnostics.functions import make_conflict, make_functions
 from srl_jax.diagnostics.run import Diagnostics, kept_steps
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
-from srl_jax.modes import MODES
-from srl_jax.optim import RL
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import RL
+from srl_jax.learning.update import Hyper
 from srl_jax.replay import Replay
 from srl_jax.types import Objective, TrainState
-from srl_jax.update import Hyper
 from tests.helpers import SMALL, jit, make_encoder, make_window, random_params
 
 

@@ -17,7 +17,8 @@ from absl import flags
 from experiments import arms
 from experiments.command_line import flags as config_flags
 from experiments.command_line.cli import COMMANDS
-from srl_jax import encoders, envs, modes, objectives, rl
+from srl_jax import encoders, envs, objectives, rl
+from srl_jax.learning import modes
 from srl_jax.plugins import Registry
 from srl_jax.types import Context, Latents, Window
 

@@ -10,11 +10,11 @@ from srl_jax.augment import UNCHANGED
 from srl_jax.encoders.convolutional import RADIUS, Layer, convolutional_encoder
 from srl_jax.encoders.lix import MOST, Mixing, discontinuity, mixed, moved, tuned
 from srl_jax.encoders.options import End, Start
-from srl_jax.latents import make_losses
-from srl_jax.modes import MODES
-from srl_jax.optim import make_optimizer
+from srl_jax.learning.latents import make_losses
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import make_optimizer
+from srl_jax.learning.update import make_init, passes
 from srl_jax.types import Context, Encoder
-from srl_jax.update import make_init, passes
 from tests import helpers
 from tests.helpers import NUM_ACTIONS, SIZE, STACK, draw, jit, make_window
 
@@ -137,5 +137,3 @@ def test_options_of_a_lix():
     )
     with pytest.raises(ValueError, match="lix must be at most 2"):
         encoders.a_lix((20, 20, 4), lix=3.0)
-    with pytest.raises(ValueError, match="nothing reads lix_goal"):
-        encoders.a_lix((20, 20, 4), lix_goal=0.5)

@@ -1,5 +1,7 @@
 """srl_jax/encoders: sizes against the thesis, mirrors, and what goes in."""
 
+import re
+
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -161,13 +163,18 @@ def test_a_start_or_an_end_that_cannot_be_is_refused(option):
         encoders.tiny((42, 42, STACK), **option)
 
 
+@pytest.mark.parametrize("row", encoders.REGISTRY)
+@pytest.mark.parametrize("shape", [(42, 42), (1, 42, 42, 4), (), (84, 0, 4)])
+def test_a_shape_that_is_none_of_an_observation_is_refused(row, shape):
+    with pytest.raises(
+        ValueError, match=rf"^observation_shape must be \(H, W, S \* C\), not {re.escape(str(shape))}$"
+    ):
+        encoders.REGISTRY[row](shape)
+
+
 def test_options_of_one_row_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match="padding: did you mean same"):
         encoders.nature((84, 84, 4), padding="SAME")
-    with pytest.raises(
-        ValueError, match="layer_norm=false is of the default end; leave it out beside end=tanh"
-    ):
-        encoders.sac_ae((84, 84, 4), layer_norm=False, end="tanh")
 
 
 class Ended(nn.Module):

@@ -6,13 +6,15 @@ import pytest
 from srl_jax import envs
 
 
-@pytest.mark.parametrize("sticky_actions", [0.0, 0.25])
-def test_the_emulator_whose_memory_is_read_is_in_step(sticky_actions):
+@pytest.mark.parametrize(("sticky_actions", "full_actions"), [(0.0, False), (0.25, True)])
+def test_the_emulator_whose_memory_is_read_is_in_step(sticky_actions, full_actions):
     pytest.importorskip("ale_py")
     from srl_jax.envs.ram import OutOfStep, Twin
 
-    env = envs.make("Pong", num_envs=1, seed=0, sticky_actions=sticky_actions, reseed_every=120)
-    twin = Twin("Pong", sticky_actions=sticky_actions, noop_max=30)
+    options = {"sticky_actions": sticky_actions, "full_actions": full_actions}
+    env = envs.make("Pong", num_envs=1, seed=0, reseed_every=120, **options)
+    assert env.single_action_space.n == (18 if full_actions else 6)
+    twin = Twin("Pong", noop_max=30, **options)
     rng = np.random.default_rng(0)
     for _ in range(3):  # the third of them has another seed
         frames, info = env.reset()

@@ -5,7 +5,8 @@ import pytest
 from gymnasium.spaces import Box
 
 from srl_jax import envs
-from srl_jax.run.evaluate import evaluate
+from srl_jax.run import evaluate as module
+from srl_jax.run.evaluate import evaluate, telling
 
 
 class Scripted:
@@ -139,3 +140,26 @@ def test_progress_is_told_after_every_step():
         Scripted([[[7.0]], [[1.0, 1.0, 1.0]]]), games=3, told=lambda steps, games: told.append((steps, games))
     )
     assert told == [(1, 1), (2, 2), (3, 3)]
+
+
+class Shown:
+    """A progress bar that keeps what it is told."""
+
+    def update(self, done, **fields):
+        self.done, self.fields = done, fields
+
+
+@pytest.mark.parametrize(("games", "left"), [(2, "0:00:50 left"), (4, "0:01:50 left")])
+def test_the_time_left_is_bounded_until_games_have_ended(monkeypatch, games, left):
+    # Two environments take 50 steps in 10 s; games are cut after 300, and four of them take two rounds.
+    clock = iter([100.0, 110.0, 120.0, 130.0])
+    monkeypatch.setattr(module.time, "monotonic", lambda: next(clock))
+    shown = Shown()
+    told = telling(shown, games, 2, 300)
+    told(50, 0)
+    assert shown.done == 0 and shown.fields["env steps"] == "100" and shown.fields["steps/s"] == "10"
+    assert shown.fields["at most"] == left
+    told(100, 1)
+    assert shown.done == 1 and (shown.fields["at most"] is None) == (games == 4)
+    told(150, games)
+    assert shown.fields["at most"] is None

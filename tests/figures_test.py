@@ -67,6 +67,16 @@ def test_numbers_by_hand(runs):
     assert "against_baseline" not in a
 
 
+def test_final_games_are_in_the_json_where_all_seeds_have_them(tmp_path):
+    for seed, final in enumerate([(1, 3), (4, 6)]):
+        write_run(tmp_path / f"Catch/a/seed{seed}", seed=seed, final_games=2, final=final)
+        more = {"final": (1, 2)} if seed else {}
+        write_run(tmp_path / f"Catch/b/seed{seed}", seed=seed, final_games=2, mode="joint", **more)
+    a, b = _evaluated(tmp_path)["games"]["Catch"]["arms"].values()
+    assert (a["final"]["mean"], a["final"]["games"], a["final"]["kind"]) == (3.5, 2, "Student's t")
+    assert a["at_the_end"]["mean"] == 2 and "final" not in b
+
+
 def test_a_longer_arm_is_compared_where_the_others_are(tmp_path):
     write_run(tmp_path / "Catch/a/seed0", (0, 2))
     write_run(tmp_path / "Catch/b/seed0", (0, 1, 1), mode="joint")

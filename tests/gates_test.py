@@ -6,13 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from srl_jax import modes
-from srl_jax.agent import make_agent
+from srl_jax import checks
 from srl_jax.errors import ConfigError
-from srl_jax.modes import GATES, MODES, PROJECTING
-from srl_jax.optim import PROJECTIONS, RL, make_optimizer
+from srl_jax.learning.agent import make_agent
+from srl_jax.learning.modes import GATES, MODES, PROJECTING
+from srl_jax.learning.optim import PROJECTIONS, RL, make_optimizer
+from srl_jax.learning.update import Hyper, make_init, make_update, passes
 from srl_jax.types import Objective
-from srl_jax.update import Hyper, make_init, make_update, passes
 from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_encoder, make_window, random_state
 from tests.modes_test import FRAME, TERMS, WINDOW, small
 
@@ -174,22 +174,25 @@ def test_a_gate_is_refused_where_no_two_gradients_meet(mode, gate):
     start = {"encoder_from": "x"} if MODES[mode].encoder_start == "checkpoint" else {}
     config = small(mode, gate=gate, encoder_optimizer="summed", **start)
     if mode == "joint" or gate == "sum":
-        return modes.check(config)
+        assert checks.check(config, given=["gate"]).gate == gate
+        return
     with pytest.raises(
-        ConfigError, match=f"^--gate={gate}: in --mode={mode} RL and .* give sum, or --mode=joint$"
+        ConfigError, match=f"^--gate={gate}: .* in --mode={mode}, where .*modes that do: joint"
     ):
-        modes.check(config)
+        checks.check(config, given=["gate"])
+    assert checks.check(config, given=[]).gate == "sum"  # a preset's
 
 
 @pytest.mark.parametrize("gate", GATES)
 def test_a_projection_is_refused_where_the_second_gradient_comes_later(gate):
     config = small("joint", gate=gate)  # separate
     if gate not in PROJECTING:
-        return modes.check(config)
+        assert checks.check(config, given=["gate"]).gate == gate
+        return
     with pytest.raises(
         ConfigError, match=f"^--gate={gate}: .*=separate .* give --encoder_optimizer=summed or"
     ):
-        modes.check(config)
+        checks.check(config)
 
 
 @pytest.mark.parametrize(
@@ -199,8 +202,11 @@ def test_a_second_rate_is_refused_with_what_leaves_the_encoder_one_optimizer_or_
     start = {"encoder_from": "x"} if mode in ("frozen", "finetuned") else {}
     config = small(mode, gate=gate, lr_encoder_srl=0.1, **start)
     if (mode, gate) == ("joint", "sum"):
-        return modes.check(config)
-    of = f"with --mode={mode}, --gate={gate} and --encoder_optimizer=separate the encoder has one optimizer"
-    reason = "--mode=frozen never moves the encoder" if mode == "frozen" else of
-    with pytest.raises(ConfigError, match=f"^--lr_encoder_srl=0.1: {reason}.* give 0$"):
-        modes.check(config)
+        assert checks.check(config, given=["lr_encoder_srl"]).lr_encoder_srl == 0.1
+        return
+    reason = f"with --gate={gate}, where" if mode == "joint" else f"in --mode={mode}, where RL and"
+    reason = "in --mode=frozen, which never moves the encoder" if mode == "frozen" else reason
+    with pytest.raises(
+        ConfigError, match=f"^--lr_encoder_srl=0.1: nothing reads it {reason}.* leave it out$"
+    ):
+        checks.check(config, given=["lr_encoder_srl"])

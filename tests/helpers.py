@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.agent import Agent, Seeds, make_agent, over_seeds
 from srl_jax.config import Config
 from srl_jax.files import checkpoint
+from srl_jax.learning.agent import Agent, Seeds, make_agent, over_seeds
 from srl_jax.run import ending
 from srl_jax.run.ending import Ending
 from srl_jax.types import Context, Decoder, Encoder, Latents, Objective, TrainState, Window
@@ -52,7 +52,8 @@ jit = jax.jit
 
 HOST_ONLY = (
     "game", "seed", "steps", "buffer_size", "updates_per_step", "learn_start", "gamma", "lr_final_share",
-    "beta", "beta_final", "eval_every", "eval_games", "eval_max_steps", "stop_at_return", "log_every",
+    "beta", "beta_final", "eval_every", "eval_games", "eval_max_steps", "final_games", "eval_envs",
+    "stop_at_return", "log_every",
     "checkpoint_every", "keep_encoder_every", "keep_best", "keep_replay", "diagnostics", "diagnostics_kept",
     "loggers", "encoder_from", "heads_from", "policy_from", "pretrain_epsilon",
 )  # fmt: skip
@@ -228,7 +229,7 @@ def one_run(config: Config, path: Path | None = None, **options):
 
 
 def write_run(
-    path: Path, returns=(1.0, 2.0), every: int = 100, ended: Ending | None = None, **values
+    path: Path, returns=(1.0, 2.0), every: int = 100, ended: Ending | None = None, final=(), **values
 ) -> Path:
     """A run directory as training leaves it, less its checkpoints: evaluations every so many env steps.
 
@@ -237,6 +238,7 @@ def write_run(
         returns: mean return of each evaluation.
         every: env steps between two.
         ended: how, where it says so.
+        final: returns of its final games.
         **values: fields of its Config.
     """
     path.mkdir(parents=True)
@@ -246,6 +248,10 @@ def write_run(
         {"kind": "eval", "env_steps": every * i, "updates": i, "wall_s": 0.5, "eval/return_mean": x}
         for i, x in enumerate(returns)
     ]
+    if final:
+        played = {"final/returns": list(final), "final/return_mean": sum(final) / len(final)}
+        row = {"kind": "final", "env_steps": rows[-1]["env_steps"], "updates": 9, "wall_s": 1.0}
+        rows.append(row | played | {"final/games": len(final)})
     rows.insert(1, {"kind": "train", "env_steps": every // 2, "updates": 0, "wall_s": 0.1})
     (path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
     if ended is not None:

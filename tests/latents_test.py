@@ -1,4 +1,4 @@
-"""srl_jax/latents.py: what each loss sees of a window, by which parameters; and how often it is encoded."""
+"""srl_jax/learning/latents.py: what each loss sees of a window, by which parameters; how often it encodes."""
 
 import re
 
@@ -11,11 +11,10 @@ from srl_jax import augment
 from srl_jax.augment import Views, make_view, random_shift
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.latents import make_latents
-from srl_jax.modes import MODES
-from srl_jax.optim import RL, make_optimizer
-from srl_jax.plugins import Registry
-from srl_jax.update import (
+from srl_jax.learning.latents import make_latents
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import RL, make_optimizer
+from srl_jax.learning.update import (
     Hyper,
     ema,
     make_init,
@@ -24,6 +23,7 @@ from srl_jax.update import (
     passes,
     periodic,
 )
+from srl_jax.plugins import Registry
 from srl_jax.window import observation
 from tests.helpers import jit
 from tests.update_test import PIXELS, RATES, SMALL, make_peek, make_peeks

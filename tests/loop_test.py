@@ -22,11 +22,11 @@ from srl_jax.envs.catch import Catch
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
-from srl_jax.modes import ENCODER_OPTIMIZERS
+from srl_jax.learning.modes import ENCODER_OPTIMIZERS
+from srl_jax.learning.update import Hyper
 from srl_jax.run import actor, loop
 from srl_jax.run.schedules import Schedules
 from srl_jax.types import Window
-from srl_jax.update import Hyper
 from tests.helpers import JOINT, SMALL, one_run, whole
 
 pytestmark = pytest.mark.usefixtures("shared_agents")

@@ -1,4 +1,4 @@
-"""srl_jax/modes.py and agent.py: the mode x parameter-group matrix, of small but real runs."""
+"""srl_jax/learning/modes.py and agent.py: the mode x parameter-group matrix, of small but real runs."""
 
 import dataclasses
 import functools
@@ -10,12 +10,12 @@ import optax
 import pytest
 
 from srl_jax import encoders, objectives, rl
-from srl_jax.agent import make_agent
 from srl_jax.config import Config
-from srl_jax.modes import MODES
-from srl_jax.optim import RL, make_optimizer
+from srl_jax.learning.agent import make_agent
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import RL, make_optimizer
+from srl_jax.learning.update import ema, make_init, make_update, periodic
 from srl_jax.types import Context, Objective
-from srl_jax.update import ema, make_init, make_update, periodic
 from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_window, random_state
 
 TERMS = ("reconstruction", "inverse")

@@ -6,8 +6,10 @@ import pytest
 
 from srl_jax import encoders, objectives
 from srl_jax.envs import make
-from srl_jax.latents import make_latents
-from srl_jax.modes import MODES
+from srl_jax.learning.latents import make_latents
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import make_optimizer
+from srl_jax.learning.update import Hyper, make_init, make_update
 from srl_jax.objectives.forward_pixels import ActionGate
 from srl_jax.objectives.reconstruction import (
     change_weights,
@@ -17,9 +19,7 @@ from srl_jax.objectives.reconstruction import (
     spectrally_normalised,
     weighted_squared_error,
 )
-from srl_jax.optim import make_optimizer
 from srl_jax.types import Context, Window
-from srl_jax.update import Hyper, make_init, make_update
 from srl_jax.window import image
 from tests import helpers
 from tests.helpers import (

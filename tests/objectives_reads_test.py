@@ -6,19 +6,19 @@ import numpy as np
 import pytest
 
 from srl_jax import encoders, objectives, rl, specs
-from srl_jax.agent import components
 from srl_jax.augment import UNCHANGED
 from srl_jax.config import Config
 from srl_jax.diagnostics.functions import make_functions
 from srl_jax.encoders.convolutional import Layer, convolutional_encoder
 from srl_jax.encoders.options import End, Start
-from srl_jax.latents import make_losses
 from srl_jax.layers import Conv, ConvTranspose
-from srl_jax.modes import MODES
-from srl_jax.optim import RL, RL_SRL, make_optimizer
-from srl_jax.resets import reset
+from srl_jax.learning.agent import components
+from srl_jax.learning.latents import make_losses
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import RL, RL_SRL, make_optimizer
+from srl_jax.learning.resets import reset
+from srl_jax.learning.update import Hyper, make_init, make_update, passes
 from srl_jax.types import Context, Objective, TrainState
-from srl_jax.update import Hyper, make_init, make_update, passes
 from tests import helpers
 from tests.helpers import (
     NUM_ACTIONS,
@@ -171,7 +171,6 @@ def test_a_reset_of_rls_head_resets_its_copies_and_both_adams():
     [
         ({"mode": "pretrain"}, "needs an RL head that is trained beside it"),
         ({"rl": "iqn"}, "begins with a linear layer over the latent"),
-        ({"objectives": ("spr:projection=rl,hidden=64",)}, "leave hidden out"),
         ({"objectives": ("spr:projection=rk",)}, "projection: valid: own, rl"),
     ],
 )

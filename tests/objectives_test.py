@@ -13,14 +13,14 @@ import numpy as np
 import pytest
 
 from srl_jax import objectives, rl, specs
-from srl_jax.latents import make_latents, shut
-from srl_jax.modes import MODES
+from srl_jax.learning.latents import make_latents, shut
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import RL, make_optimizer
+from srl_jax.learning.update import Hyper, make_init, make_update, periodic
 from srl_jax.objectives.inverse import action_cross_entropy
 from srl_jax.objectives.latent_l2 import half_squared_norm
 from srl_jax.objectives.reconstruction import mean_squared_error
-from srl_jax.optim import RL, make_optimizer
 from srl_jax.types import Context, Latents, Objective, TrainState, Window
-from srl_jax.update import Hyper, make_init, make_update, periodic
 from srl_jax.window import image
 from tests import helpers
 from tests.helpers import SIZE, STACK, jit, make_context, make_encoder, make_window

@@ -1,4 +1,4 @@
-"""srl_jax/optim.py against PyTorch's Adam written out in numpy."""
+"""srl_jax/learning/optim.py against PyTorch's Adam written out in numpy."""
 
 from functools import partial
 
@@ -7,7 +7,7 @@ import numpy as np
 import optax
 import pytest
 
-from srl_jax.optim import NOT_MEASURED, make_optimizer, real_copy
+from srl_jax.learning.optim import NOT_MEASURED, make_optimizer, real_copy
 from srl_jax.types import Objective
 from tests.helpers import identical, jit, to_numpy
 

@@ -138,7 +138,7 @@ def test_an_unknown_command_is_answered_with_the_ones_there_are(monkeypatch, cap
 
 COMMANDS = [f"experiments.{command.module or name}" for name, command in cli.COMMANDS.items()]
 LIGHT = [
-    "import srl_jax.config, srl_jax.modes, srl_jax.specs, srl_jax.plugins",
+    "import srl_jax.config, srl_jax.learning.modes, srl_jax.specs, srl_jax.plugins",
     "from srl_jax import config, envs; config.Config(game='my:E-v0'); assert len(envs.NAMES) == 59",
     "import srl_jax.data; srl_jax.data.reference_policies('Pong')",
     "import srl_jax.statistics",

@@ -157,6 +157,14 @@ def test_a_run_that_may_get_more_rows_is_left_out(root, tmp_path):
     assert packing.pack(root, tmp_path / "out") == (5, 5, [part, none])
 
 
+def test_a_run_that_may_be_playing_its_final_games_is_left_out(tmp_path):
+    part = write_run(tmp_path / "runs/part", steps=100, final_games=2)
+    write_run(tmp_path / "runs/whole", steps=100, final_games=2, final=(1, 2), ended=Ending("finished", 100))
+    assert packing.pack(tmp_path / "runs", tmp_path / "out") == (1, 1, [part])
+    (run,) = packing.read(tmp_path / "out")
+    assert run.rows[-1]["final/returns"] == [1, 2]
+
+
 def test_a_row_that_has_a_key_of_packing_is_refused(root, tmp_path):
     with open(root / "alone_seed10/metrics.jsonl", "a") as file:
         file.write(json.dumps(ROW | {"seed": 1}) + "\n")

@@ -13,9 +13,10 @@ from experiments.presets import (
     source_preset,
     summary,
 )
-from srl_jax import modes, specs
+from srl_jax import checks, encoders, objectives, rl, specs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from srl_jax.learning import modes
 
 # The arms of every figure of the thesis, and the runs that make their encoders.
 ARMS = [
@@ -58,10 +59,21 @@ def test_every_mode_has_a_catch_preset():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_is_a_valid_run(name):
-    config = _config(name)
-    modes.check(config)
+    config = checks.check(_config(name), given=())
     full = train.resolved(config)
     assert train.resolved(full) == full
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_what_a_preset_sets_is_read_in_this_mode_or_in_another(name):
+    config = _config(name)
+    learner = specs.parse(config.rl, rl.REGISTRY, "rl")
+    run = checks.run_of(config, rl=learner)
+    assert all(why.startswith("in --mode=") for _, why in run.unread()), [*run.unread()]
+    registries = {"encoder": encoders.REGISTRY, "objective": objectives.REGISTRY}
+    parsed = [("encoder", config.encoder), *(("objective", text) for text in config.objectives)]
+    for spec in (learner, *(specs.parse(text, registries[kind], kind) for kind, text in parsed)):
+        assert not [*run.unread_options(spec)]
 
 
 @pytest.mark.parametrize("name", [f"thesis/{arm}" for arm in ARMS])
@@ -144,7 +156,7 @@ def test_what_stands_later_overrides():
         ("thesis/joint_25", "did you mean thesis/joint_256"),
         ("thesis/joint_256+smal", "did you mean small"),
         ("small", "small changes a preset; write it behind one"),
-        ("catch/joint+", "valid: small, textbook, aug"),
+        ("catch/joint+", "valid: small, textbook, aug, protocol/dopamine_100k"),
     ],
 )
 def test_a_preset_that_there_is_not_is_refused(name, told):

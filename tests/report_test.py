@@ -18,6 +18,7 @@ from experiments.drawing import images, plots
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
+from tests import helpers
 
 pytest.importorskip("PIL.Image", reason="needs the extra plots")
 pages = pytest.importorskip("experiments.reporting.page", reason="needs the extra plots")
@@ -233,6 +234,18 @@ def test_numbers_by_hand(page):
         assert over[f"{name} policy"] == [*[f"{normal:.2f}"] * 3, f"{1 - normal:.2f}", "–", "–"]
 
 
+def test_final_games_have_a_column_and_a_run_without_its_own_is_not_finished(tmp_path):
+    for seed, final in enumerate([(1, 3), (4, 6)]):
+        helpers.write_run(tmp_path / f"Catch/a/seed{seed}", seed=seed, final=final, final_games=2, steps=100)
+    helpers.write_run(tmp_path / "Catch/b/seed0", final_games=2, steps=100, lr_rl=1e-3)
+    page = Page(build(tmp_path))
+    cells = {arm: row[-1] for arm, row in page.table("Statistics of Catch").items()}
+    assert cells["arm"] == "final games" and cells["b"] == "–"
+    assert cells["a"] == "3.50 [−15.56, 22.56] 2 games of each of 2 seeds after 100 env steps"
+    assert "2 after the last env step; epsilon" in page.text
+    assert [row[1] for name, row in page.table("Every run").items() if name != "run"] == ["yes", "yes", "no"]
+
+
 def test_two_seeds_tell_little(page):
     assert f"rl has 0.31 [−2.07, 2.69]. Not told apart: joint. No interval: {ODD}." in page.text
     assert "Better:" not in page.text and "▲" not in "".join(page.table("Statistics of Catch")["joint"])
@@ -283,7 +296,7 @@ def test_the_same_runs_give_the_same_bytes_and_the_rows_are_beside_them(runs, te
     )
     assert row["game"] == "Catch" and row["eval/return_mean"] == "5.0" and row["loss/rl"] == ""
     assert "diag/drift/cka" not in row and "env_steps" not in row
-    with pytest.raises(ConfigError, match="report.html exists; .*--overwrite"):
+    with pytest.raises(ConfigError, match="report.html: exists; .*--overwrite"):
         report.report(parsed(f"--out={out}", f"--runs={runs}"))
     out.unlink()
     with pytest.raises(ConfigError, match="report.csv exists; .*--overwrite"):

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files.metrics import read_metrics, strip_wall
-from srl_jax.optim import NOT_MEASURED
+from srl_jax.learning.optim import NOT_MEASURED
 from srl_jax.run import reporting
 from srl_jax.run.reporting import Means, Report
 

@@ -1,4 +1,4 @@
-"""srl_jax/resets.py and srl_jax/annealing.py: what a reset leaves, and when; n and gamma after it."""
+"""srl_jax/learning/resets.py and annealing.py: what a reset leaves, and when; n and gamma after it."""
 
 from functools import partial
 
@@ -7,17 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import annealing, modes
+from srl_jax import checks
 from srl_jax.config import Config, resolve
 from srl_jax.errors import ConfigError
-from srl_jax.modes import MODES
+from srl_jax.learning import annealing
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import make_optimizer
+from srl_jax.learning.resets import reset, reset_key
+from srl_jax.learning.update import Hyper, make_init, passes, periodic
 from srl_jax.objectives import REGISTRY
-from srl_jax.optim import make_optimizer
-from srl_jax.resets import reset, reset_key
 from srl_jax.rl import rainbow
 from srl_jax.run.schedules import Schedules, printed
 from srl_jax.types import TrainState
-from srl_jax.update import Hyper, make_init, passes, periodic
 from tests.helpers import fill, identical, make_context, make_encoder
 
 BBF = dict(
@@ -186,13 +187,13 @@ def test_without_flags_rows_and_windows_have_nothing_new():
         ({"n_anneal": "10->3@0"}, "--n_anneal=10->3@0: must be annealed over at least 1 update"),
         ({"gamma_anneal": "0.9->1@5"}, "--gamma_anneal=0.9->1@5: 1.0 must be at least 0 and below 1"),
         ({"gamma_anneal": "0.9->0.997@5"}, "ends at --gamma, which is 0.99; give --gamma=0.997"),
-        ({"gamma_anneal": "0.9->0.99@5", "mode": "pretrain"}, "--mode=pretrain trains no RL"),
+        ({"gamma_anneal": "0.9->0.99@5", "mode": "pretrain"}, "--mode=pretrain, which trains no RL"),
         ({"reset": "head"}, "--reset=head: give --reset_every"),
-        ({"reset_every": 5}, "--reset_every=5: --reset=none resets nothing"),
-        ({"reset_last": 5}, "--reset_last=5: --reset=none resets nothing"),
+        ({"reset_every": 5}, "--reset_every=5: nothing reads it with --reset=none"),
+        ({"reset_last": 5}, "--reset_last=5: nothing reads it with --reset=none"),
         ({"reset": "head", "reset_every": 9, "reset_last": 8}, "--reset_last=8: is before the first reset"),
-        ({"reset": "head", "reset_every": 9, "shrink": 0.1}, "--shrink=0.1: --reset=head shrinks nothing"),
-        ({"reset": "all", "reset_every": 9, "mode": "pretrain"}, "--mode=pretrain trains no RL, whose heads"),
+        ({"reset": "head", "reset_every": 9, "shrink": 0.1}, "nothing reads it without --reset=all"),
+        ({"reset": "all", "reset_every": 9, "mode": "pretrain"}, "nothing reads it in --mode=pretrain"),
         ({"reset": "all", "reset_every": 9, "mode": "frozen"}, "--mode=frozen never moves the encoder"),
     ],
     ids=str,
@@ -201,7 +202,7 @@ def test_what_makes_no_sense_is_refused_in_a_line(values, message):
     extra = {"objectives": ("inverse",)} if values.get("mode") == "pretrain" else {}
     extra |= {"encoder_from": "runs/x"} if values.get("mode") == "frozen" else {}
     with pytest.raises(ConfigError) as error:
-        modes.check(Config(**values, **extra))
+        checks.check(Config(**values, **extra))
     assert message in str(error.value) and "\n" not in str(error.value)
 
 
@@ -211,7 +212,16 @@ def test_a_reset_of_the_head_makes_sense_in_every_mode_with_rl(name):
     if mode.rl:
         objectives = ("inverse",) if mode.representation else ()
         start = "" if mode.encoder_start == "scratch" else "runs/x"
-        modes.check(Config(mode=name, reset="head", reset_every=9, objectives=objectives, encoder_from=start))
+        checks.check(
+            Config(mode=name, reset="head", reset_every=9, objectives=objectives, encoder_from=start)
+        )
+
+
+def test_a_schedule_that_means_the_same_is_the_same_configuration():
+    registry = {"rainbow": lambda context, *, n_step=3: None}
+    values = {"n_anneal": "3->1@1e4", "gamma_anneal": "0.90->0.99@1_000"}
+    full = resolve(Config(**values), registry, {"nature": lambda shape: None}, {})
+    assert (full.n_anneal, full.gamma_anneal) == ("3->1@10000", "0.9->0.99@1000")
 
 
 def test_the_larger_n_is_that_of_rl():

@@ -16,7 +16,7 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
-from srl_jax.run import loop, seed
+from srl_jax.run import evaluations, loop
 from srl_jax.run.actor import seed_for
 from tests.helpers import SMALL, agent_of, all_moved, identical, one_run
 from tests.rundir_test import contents
@@ -191,13 +191,13 @@ def test_a_run_goes_on_without_the_encoder_that_it_started_from(whole, tmp_path)
 @pytest.mark.parametrize("stop", [120, 124])
 def test_a_return_that_ends_a_run_ends_it_all_the_same(tmp_path, monkeypatch, stop):
     # The evaluation of 120 reaches it, which ends the run when the next row is due, at 160.
-    evaluate = seed.evaluate
+    evaluate = evaluations.evaluate
 
     def better(policy, env, *, seed, **options):
         played = evaluate(policy, env, seed=seed, **options)
         return played and played._replace(returns=[float(seed == seed_for(0, "eval", 120))] * 5)
 
-    monkeypatch.setattr(seed, "evaluate", better)
+    monkeypatch.setattr(evaluations, "evaluate", better)
     config = make_config("rl_only", stop_at_return=0.5)
     result, whole_end = go(config, tmp_path / "whole")
     assert result.env_steps == 160 and '"best": 1.0' in whole_end["play"] and not result.interrupted
@@ -253,11 +253,15 @@ OF_A_RUN = {
     },
     "of the process": {"env_threads"},
 }  # fmt: skip
+OF_EVALUATIONS = {
+    "in parts": {"under_way", "best", "recording"},
+    "of the process": {"games", "thread", "_envs"},
+    "of the configuration": {"_config", "_agent", "_report", "_keep"},
+}
 OF_A_SEED = {
     "in parts": {
-        "replay", "env", "report", "stacks", "score", "rng", "recording", "best", "evaluating",
+        "replay", "env", "report", "stacks", "score", "rng", "evaluations",
     },
-    "of the process": {"games", "eval_thread", "eval_env"},
     "the checkpoint itself": {"saved", "saved_position"},
     "of the configuration": {"config", "out", "agent", "key", "policy"},
     "in encoders/": {"diagnostics"},
@@ -269,7 +273,9 @@ def test_every_attribute_of_a_run_is_in_its_checkpoint_or_follows_from_the_confi
     run = make_run(make_config("rl_only"), tmp_path / "run")
     run.env_threads.shutdown()
     assert set(vars(run)) == set().union(*OF_A_RUN.values())
-    assert set(vars(run.seeds[0])) == set().union(*OF_A_SEED.values())
+    (seed,) = run.seeds
+    assert set(vars(seed)) == set().union(*OF_A_SEED.values())
+    assert set(vars(seed.evaluations)) == set().union(*OF_EVALUATIONS.values())
 
 
 # What a checkpoint must be

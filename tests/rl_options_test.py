@@ -9,13 +9,13 @@ import pytest
 import rlax
 
 from srl_jax import rl
-from srl_jax.agent import slow_params
-from srl_jax.latents import named_key
-from srl_jax.optim import RL
+from srl_jax.learning.agent import slow_params
+from srl_jax.learning.latents import named_key
+from srl_jax.learning.optim import RL
+from srl_jax.learning.update import periodic
 from srl_jax.rl import values
 from srl_jax.rl.losses import n_step
 from srl_jax.types import Context, Latents, TrainState, Window
-from srl_jax.update import periodic
 from tests.helpers import jit, random_params
 from tests.rl_test import ACTIONS, ATOMS, BATCH, CONTEXT, FEATURES, make_case, make_latents, network, softmax
 

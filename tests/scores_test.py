@@ -86,6 +86,12 @@ def test_what_has_no_score_is_left_out_and_said(runs):
     assert early.name == "seed4"
 
 
+def test_a_run_that_may_be_playing_its_final_games_has_no_score(tmp_path):
+    write_run(tmp_path / "a", (0.0, 1.0, 2.0), steps=200, final_games=100)
+    score, why = scores.end_score(collect.load_runs(tmp_path / "a")[0])
+    assert score is None and why == "not at its end: 200 of 200 env steps, without its final games"
+
+
 def test_an_old_final_evaluation_of_a_run_that_went_on_does_not_count(runs):
     path = runs / "Boxing/der/seed0"
     row = {"kind": "eval", "env_steps": 300, "updates": 9, "wall_s": 3.0, "eval/return_mean": 7.0}

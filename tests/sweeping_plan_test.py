@@ -43,9 +43,9 @@ def test_what_a_process_elsewhere_imports_is_named_absolutely(tmp_path, monkeypa
     (run,) = plan.plan([arm_of("small/joint_256")], ["Catch"], [0], flags)
     assert run.flags["import"] == (f"{tmp_path}/mine.py",)
     assert run.flags["logger"] == ("csv", f"{tmp_path}/mine.py:Mine", "wandb:project=a")
-    assert manifest.parsed(run).loggers == run.flags["logger"]
+    assert manifest.parsed(run)[0].loggers == run.flags["logger"]
     (run,) = plan.plan([arm_of("small/joint_256")], ["Catch"], [0], {"logger": "none"})
-    assert run.flags["logger"] == ("none",) and manifest.parsed(run).loggers == ()
+    assert run.flags["logger"] == ("none",) and manifest.parsed(run)[0].loggers == ()
 
 
 @pytest.mark.parametrize(
@@ -144,6 +144,29 @@ def test_configurations_are_those_that_training_writes():
 def test_settings_that_cannot_be_run_name_the_run(arm, says):
     with pytest.raises(ConfigError, match=says):
         manifest.resolve(plan.plan([arm], ["Catch"], [0]))
+
+
+def test_a_flag_for_every_run_need_not_be_read_by_each():
+    arms = [Arm("frozen_256", "small/frozen_256"), Arm("joint", "catch/joint")]
+
+    def planned(flags, *arms):
+        return manifest.resolve(plan.plan(arms, ["Catch"], [0], {"encoder": "tiny:features=8", **flags}))
+
+    found = planned({"lr_srl": "0.5"}, *arms)
+    given = {
+        name.split("/")[1]: (entry.run.flags.get("lr_srl"), entry.config.lr_srl)
+        for name, entry in found.items()
+    }
+    read, unread = ("0.5", 0.5), (None, 1e-4)
+    assert given == {"rl_only_nature": unread, "pretrain_256": read, "frozen_256": unread, "joint": read}
+    for flags, of_one in (
+        ({"srl_every": "2"}, {}),
+        ({}, {"lr_srl": "0.5"}),
+    ):  # no run reads it; one has it alone
+        with pytest.raises(
+            ConfigError, match="^Catch/[a-z0-9_]+/seed0: --(srl_every|lr_srl)=.*: nothing reads it"
+        ):
+            planned(flags, arms[0]._replace(flags=of_one))
 
 
 def test_a_grid_is_an_arm_for_each_combination():

@@ -321,9 +321,12 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys
 
 
 def test_a_flag_that_a_game_has_no_use_for_is_named(capsys, loop, tmp_path):
-    train_in_process("--game=Catch", "--sticky_actions=0.25", f"--out={tmp_path}/a")
-    assert "--sticky_actions: changes nothing, Catch has none" in capsys.readouterr().err
-    train_in_process("--game=Pong", "--sticky_actions=0.25", f"--out={tmp_path}/b")
+    train_in_process("--game=Catch", "--sticky_actions=0.25", "--nolife_loss", f"--out={tmp_path}/a")
+    said = capsys.readouterr().err
+    assert all(
+        f"--{name}: changes nothing, Catch has none" in said for name in ("sticky_actions", "life_loss")
+    )
+    train_in_process("--game=Pong", "--nolife_loss", "--sticky_actions=0.25", f"--out={tmp_path}/b")
     train_in_process("--preset=catch/rl_only", f"--out={tmp_path}/c")
     assert "changes nothing" not in capsys.readouterr().err
 

@@ -10,7 +10,7 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files.metrics import read_metrics
 from srl_jax.run import ending
-from srl_jax.training import check_sources, resolved
+from srl_jax.training import check_sources, completed, resolved
 from tests.checkpoint_test import CONFIG, write
 from tests.helpers import SMALL
 
@@ -99,6 +99,16 @@ def test_a_source_that_does_not_fit_is_refused(tmp_path, flag, change, message):
     else:
         with pytest.raises(ConfigError, match=f"--{flag}={tmp_path}: {message}"):
             check_sources(config)
+
+
+def test_an_encoder_of_before_there_was_an_option_has_its_default(tmp_path):
+    full = completed(CONFIG).encoder
+    assert full.startswith("tiny:") and "init=pytorch" in full
+    write(tmp_path)  # as few options as CONFIG has
+    config = dataclasses.replace(CONFIG, **SOURCES["encoder_from"], encoder_from=str(tmp_path))
+    check_sources(dataclasses.replace(config, encoder=full))
+    with pytest.raises(ConfigError, match=f"encoder is {CONFIG.encoder} there and tiny:features=9"):
+        check_sources(dataclasses.replace(config, encoder="tiny:features=9"))
 
 
 def test_a_representation_run_has_no_policy(tmp_path):

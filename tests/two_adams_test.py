@@ -1,4 +1,4 @@
-"""srl_jax/update.py: how two losses step one encoder, against PyTorch's own Adams.
+"""srl_jax/learning/update.py: how two losses step one encoder, against PyTorch's own Adams.
 
 `two_adams.json` was made by `python -m tests.two_adams_test`, which needs PyTorch (2.13 then): ten updates
 of a small network, as the thesis' authors write them, in each of the three forms.
@@ -12,10 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax.modes import ENCODER_OPTIMIZERS, MODES
-from srl_jax.optim import NOT_MEASURED, RL, make_optimizer
+from srl_jax.learning.modes import ENCODER_OPTIMIZERS, MODES
+from srl_jax.learning.optim import NOT_MEASURED, RL, make_optimizer
+from srl_jax.learning.update import NORM_EVERY, Hyper, make_init, make_update, passes, periodic
 from srl_jax.types import Encoder, Objective, Window
-from srl_jax.update import NORM_EVERY, Hyper, make_init, make_update, passes, periodic
 from tests.helpers import jit
 
 EXPECTED = Path(__file__).with_suffix(".json").with_name("two_adams.json")

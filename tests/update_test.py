@@ -1,4 +1,4 @@
-"""srl_jax/update.py: who draws which noise, how slow copies follow, how an action is chosen."""
+"""srl_jax/learning/update.py: who draws which noise, how slow copies follow, how an action is chosen."""
 
 import chex
 import jax
@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from srl_jax.augment import Views
-from srl_jax.modes import MODES
-from srl_jax.optim import RL, make_optimizer
-from srl_jax.types import Encoder, Objective
-from srl_jax.update import (
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.optim import RL, make_optimizer
+from srl_jax.learning.update import (
     Hyper,
     ema,
     follow_every,
@@ -21,6 +20,7 @@ from srl_jax.update import (
     passes,
     periodic,
 )
+from srl_jax.types import Encoder, Objective
 from srl_jax.window import observation
 from tests.helpers import all_moved, identical, jit, make_window, to_numpy
 

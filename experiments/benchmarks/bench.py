@@ -30,7 +30,7 @@ from srl_jax.files.provenance import git_revision, versions
 from srl_jax.specs import Info, choices_text
 
 from ..command_line import flags as config_flags
-from ..command_line import runtime
+from ..command_line import paths, runtime
 from .rows import GROUPS, OF_OBJECTIVES, Group
 from .worker import ROOT, Worker, WorkerError
 
@@ -93,7 +93,7 @@ def check_out(out: str | None) -> Path | None:
     """
     if not out:
         return None
-    path = config_flags.check_place("out", out)
+    path = paths.check_place("out", out)
     if path.is_dir() and any(path.iterdir()):
         raise ConfigError(f"--out={out}: not empty; name a new directory")
     return path

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from srl_jax import envs, replay
-from srl_jax.agent import make_agent
+from srl_jax.learning.agent import make_agent
 from srl_jax.run import loop
 
 from .jax_side import NUM_ACTIONS, config_of, frame_shape

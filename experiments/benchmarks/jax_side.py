@@ -10,8 +10,8 @@ import numpy as np
 from flax.traverse_util import flatten_dict
 
 from srl_jax import encoders, objectives, rl
-from srl_jax.agent import make_agent, over_seeds
 from srl_jax.config import Config, resolve
+from srl_jax.learning.agent import make_agent, over_seeds
 from srl_jax.rl import heads
 from srl_jax.types import Window
 

@@ -15,14 +15,15 @@ from typing import Any, NoReturn
 
 from absl import app, flags
 
-from srl_jax import modes, plugins, specs
+from srl_jax import checks, plugins, specs
 from srl_jax.config import INFOS, Config, unresolved
 from srl_jax.errors import EXIT_STATUS, ConfigError
 from srl_jax.files import display, loggers
 from srl_jax.files.reading import SETTINGS, read_bytes
 from srl_jax.specs import Info
 
-from ..presets import ENCODER_PRESETS, preset_values, source_preset
+from ..presets import ENCODER_PRESETS, PIECES, preset_values, source_preset
+from ..protocols import PROTOCOLS
 from . import help
 
 # The flags count as the entry point's own, so that --help shows them.
@@ -98,6 +99,8 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
         "named settings; flags beside it override them, pieces behind + change them: thesis/joint_256+small",
         flag_values=values,
     )
+    told = "how games are played and what is reported, over --preset or --config; flags beside it override it"
+    define("protocol", Info(str, told, choices=tuple(PROTOCOLS)), None, values)
     flags.DEFINE_string(
         "config",
         None,
@@ -195,7 +198,7 @@ def say_what_is_replaced(values: flags.FlagValues) -> None:
 
 
 def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool = True) -> Config:
-    """The settings that the command line asks for: defaults, then --preset or --config, then the flags given.
+    """The settings that the command line asks for: defaults, --preset or --config, --protocol, other flags.
 
     `--rl=:key=value` and `--encoder=:key=value` change options of what the preset has, for --objective see
     `with_objectives`.
@@ -205,18 +208,19 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
         complete: also demand the encoder that the mode or the preset starts from.
 
     Returns:
-        A checked Config; its specifications are not yet (that takes the registries, which import
-        jax).
+        A checked Config, with defaults where nothing reads what --preset or --config has; its specifications
+        are not checked yet (that takes the registries, which import jax).
 
     Raises:
-        ConfigError: unknown preset, a value out of its limits, or flags that do not fit together.
+        ConfigError: unknown preset, a value out of its limits, flags that do not fit together, or one that
+            nothing reads.
     """
-    given = {
-        name: values[info.flag or name].value
-        for name, info in INFOS.items()
-        if values[info.flag or name].present
-    }
+    given = {name: values[INFOS[name].flag or name].value for name in given_fields(values)}
     base, _ = _base(values, given.get("game"))
+    if protocol := values["protocol"].value:
+        if protocol not in PROTOCOLS:
+            raise ConfigError(f"--protocol={protocol}: {specs.choices_text(protocol, PROTOCOLS)}")
+        base = PIECES[f"protocol/{protocol}"](base)
     for name in ("objectives", "imports"):
         if name in given:
             texts = tuple(given[name])
@@ -240,95 +244,26 @@ def config_from_flags(values: flags.FlagValues = flags.FLAGS, *, complete: bool 
     # A preset's encoder is only asked for while its mode is: --mode beside it may need none.
     if source and config.mode == preset_values(preset.partition("+")[0])["mode"]:
         hint = f"--preset={source} --game={config.game} --out=PATH makes one"
-        modes.check(config, needs_encoder=True, hint=hint, complete=complete)
-    else:
-        modes.check(config, complete=complete)
-    return config
+        return checks.check(config, given=given, needs_encoder=True, hint=hint, complete=complete)
+    return checks.check(config, given=given, complete=complete)
 
 
-def check_place(flag: str, text: str) -> Path:
-    """The path of a directory that is there and can be written to, or can be made there; writes nothing.
-
-    Args:
-        flag: that it came from.
-        text: its value, with or without ~.
-
-    Raises:
-        ConfigError: neither holds.
-    """
-
-    def problem(path: Path) -> str:
-        if path.is_dir():
-            return "" if os.access(path, os.W_OK | os.X_OK) else "no permission to write there"
-        if os.path.lexists(path):
-            return "exists and is not a directory"
-        parent = next(p for p in path.absolute().parents if os.path.lexists(p))
-        if not parent.is_dir():
-            return f"{parent} is not a directory"
-        return "" if os.access(parent, os.W_OK | os.X_OK) else f"no permission to write in {parent}"
-
-    return _checked(flag, text, problem)
+def given_fields(values: flags.FlagValues) -> list[str]:
+    """The fields of Config whose flags were given."""
+    return [name for name, info in INFOS.items() if values[info.flag or name].present]
 
 
-def check_file(flag: str, text: str, suffix: str, *, overwrite: bool | None = None) -> Path:
-    """The path of a file that is to be made, in a directory that is there; writes nothing.
-
-    Args:
-        flag: that it came from.
-        text: its value, with or without ~.
-        suffix: what it has to end in.
-        overwrite: whether a file may be there already; None where no flag allows it.
-
-    Raises:
-        ConfigError: it has another name, or something lies there, or the directory does not.
-    """
-
-    def problem(path: Path) -> str:
-        if path.suffix.lower() != suffix:
-            return f"must end in {suffix}"
-        there = False
-        with contextlib.suppress(FileNotFoundError, NotADirectoryError):
-            there = bool(path.lstat())  # os.path.lexists takes a name that is too long for one that is free
-        if there and not overwrite:
-            hint = "" if overwrite is None else ", or --overwrite replaces it"
-            return f"exists; name a new file{hint}"
-        if there and not path.is_file():
-            return "exists and is not a file"
-        return "" if path.absolute().parent.is_dir() else "no such directory"
-
-    return _checked(flag, text, problem)
-
-
-def _checked(flag: str, text: str, problem: Callable[[Path], str]) -> Path:
-    """The path that a flag names, if no problem is found with it.
-
-    Raises:
-        ConfigError: there is one, or its name cannot be shown, or the system refuses it.
-    """
-    check_name(flag, text)
-    path = Path(os.path.expanduser(text))
-    try:
-        found = problem(path)
-    except OSError as error:
-        found = str(error.strerror)
-    if found:
-        raise ConfigError(f"--{flag}={text}: {found}")
-    return path
-
-
-def check_name(flag: str, text: str) -> None:
-    """Whether a path that is to be written to can be shown in a line.
-
-    Args:
-        flag: that it came from.
-        text: its value.
-
-    Raises:
-        ConfigError: it has a line break, another control character, or bytes that are no text.
-    """
-    odd = next((character for character in text if not character.isprintable()), None)
-    if odd is not None:
-        raise ConfigError(f"--{flag}={text}: has the character {odd!a}; name it with printable ones")
+def what_is_given(values: flags.FlagValues) -> set[str]:
+    """What the command line gives, as `srl_jax.needs.Run.refuse` takes it; no options that cannot be read."""
+    found = set(given_fields(values))
+    for prefix, text in (
+        *((name, values[name].value) for name in ("rl", "encoder") if name in found),
+        *(("", text.lstrip("+")) for text in values["objective"].value or () if "objectives" in found),
+    ):
+        with contextlib.suppress(specs.SpecError):
+            name, options = specs.split(text if not text.lstrip().startswith(":") else prefix + text.lstrip())
+            found |= {f"{prefix or name}:{option}" for option in options}
+    return found
 
 
 def fail(message: Any, status: int = 2) -> NoReturn:

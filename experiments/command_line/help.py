@@ -11,10 +11,11 @@ from srl_jax import specs
 from srl_jax.files import display
 
 from ..presets import PIECES, PIECES_HELP, PRESETS, summary
+from ..protocols import PROTOCOLS
 
 GROUPS: dict[str, str] = {
-    "Run": "preset config mode steps seed seeds import",
-    "Game": "game num_envs frame_size frame_stack reward_clip life_loss sticky_actions noop_max",
+    "Run": "preset protocol config mode steps seed seeds import",
+    "Game": "game num_envs frame_size frame_stack reward_clip life_loss sticky_actions full_actions noop_max",
     "RL": "rl gamma gamma_anneal n_anneal target_encoder slow_update_every eps_train eps_final "
     "eps_anneal_steps",
     "Resets": "reset reset_every reset_last shrink",
@@ -24,7 +25,8 @@ GROUPS: dict[str, str] = {
     "Replay": "buffer_size batch_size updates_per_step learn_start beta beta_final beta_anneal_steps",
     "Optimisation": "lr_rl lr_srl lr_encoder lr_encoder_srl lr_final_share decoder_weight_decay "
     "weight_decay max_grad_norm adam_eps",
-    "Evaluation": "eval_every eval_games eval_max_steps eps_eval stop_at_return diagnostics diagnostics_kept",
+    "Evaluation": "eval_every eval_games eval_max_steps eps_eval final_games eval_envs stop_at_return "
+    "diagnostics diagnostics_kept",
     "Output": "out resume overwrite log_every checkpoint_every keep_encoder_every keep_best keep_replay "
     "logger print_config dry_run tune_runtime",
 }
@@ -65,7 +67,7 @@ def text(about: str, values: flags.FlagValues) -> str:
         if shown:
             lines += [f"{title}:", *(line for flag in shown for line in flag), ""]
     if trains:
-        lines += ["Presets:", *_presets()]
+        lines += ["Protocols:", *_protocols(), "", "Presets:", *_presets()]
     return "\n".join(lines).rstrip()
 
 
@@ -126,3 +128,10 @@ def _presets() -> Iterator[str]:
     yield f"  {'small/NAME':34}  thesis/NAME+small"
     for name in PIECES:
         yield f"  {'PRESET+' + name:34}  {PIECES_HELP[name]}"
+
+
+def _protocols() -> Iterator[str]:
+    """What each protocol sets, as flags."""
+    for name, values in PROTOCOLS.items():
+        given = " ".join(f"--{field}={specs.value_text(value)}" for field, value in values.items())
+        yield from textwrap.wrap(given, 100, initial_indent=f"  {name:16}", subsequent_indent=" " * 18)

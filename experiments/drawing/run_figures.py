@@ -99,6 +99,9 @@ def learning_curve(
     counts = sorted({len(game) for game in games if np.isfinite(game).all()})
     notes = [f"band: worst to best of {' or '.join(map(str, counts))} games"] if counts else []
     notes += [f"dashed: the thesis, figure {figure}, {arm} (one run)"] if thesis else []
+    for row in rows:
+        if (final := row.get("final/return_mean")) is not None:
+            notes.append(f"final: {final:.4g}, the mean of {row.get('final/games', '?')} games")
     line = plots.Line("this run", curve, thesis=reference)
     panel = plots.Panel(config.game, [line], (), plots.policy_levels(config))
     return plots.draw_panels([panel], path, title, "; ".join(notes))

@@ -6,11 +6,11 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from srl_jax import envs, specs
+from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
 from srl_jax.files.provenance import history
-from srl_jax.modes import MODES
+from srl_jax.learning.modes import MODES
 
 from ..runs import collect
 from ..runs.collect import RunData
@@ -92,33 +92,19 @@ def _place(name: str) -> tuple:
 
 
 def _fields(config: Config) -> dict[str, str]:
-    """Each field as text; an option of a specification is a field of its own."""
+    """Each setting as text, an option of an objective as "objectives spr: tau"."""
     found = {}
-    for field in INFOS:
-        value = getattr(config, field)
-        if field in ("rl", "encoder", "objectives"):
-            found |= _options(field, value)
+    for field, row, option, value in collect.settings(config):
+        if row:
+            found[f"{field} {row}: {option}" if field == "objectives" else f"{field}: {option}"] = value
         elif field in ("imports", "loggers"):
             found[field] = ", ".join(Path(text).name for text in value) or "none"
         elif value and field in ("encoder_from", "policy_from"):
             # The arm that the path of a run, or of a checkpoint in it, is of.
             found[field] = collect.arm_name(Path(re.sub(r"/(checkpoints|encoders)(/.*)?$", "", value)))
-        elif field not in ("game", "seed"):
+        else:
             found[field] = value_text(value)
     return found
-
-
-def _options(field: str, value: str | Sequence[str]) -> dict[str, str]:
-    names, found = [], {}
-    for text in (value,) if isinstance(value, str) else value:
-        try:
-            name, options = specs.split(text)
-        except specs.SpecError:
-            name, options = text, {}
-        names.append(name)
-        prefix = field if isinstance(value, str) else f"{field} {name}"
-        found |= {f"{prefix}: {key}": option for key, option in options.items()}
-    return {field: " + ".join(names) or "none"} | found
 
 
 def value_text(value: Any) -> str:
@@ -136,12 +122,15 @@ def protocol_text(config: Config) -> str:
     """How a policy was evaluated, in a line; what a game does not have is not said of it."""
     game = envs.known(config.game)
     sticky = f"sticky actions {config.sticky_actions:g}" if config.sticky_actions else "no sticky actions"
+    finals = f"{config.final_games} after the last env step"
     noops = f"fewer than {config.noop_max} no-ops at the start" if config.noop_max > 1 else "no no-ops"
     frames = f", of {game.frames_per_step} frames each" if game.frames_per_step > 1 else ""
     parts = {
         f"{config.eval_games} full games an evaluation, every {config.eval_every:,} env steps": True,
+        finals: config.final_games > 0,
         f"epsilon {config.eps_eval:g}": True,
         sticky: "sticky_actions" in game.options,
+        "all 18 actions": config.full_actions and "full_actions" in game.options,
         noops: "noop_max" in game.options,
         f"at most {config.eval_max_steps:,} env steps a game{frames}": True,
         f"in training, a lost life ends {'the return' if config.life_loss else 'nothing'}": game.lives,

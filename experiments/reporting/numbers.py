@@ -69,6 +69,23 @@ class Game(NamedTuple):
         return [run for runs in self.runs.values() for run in runs if has_policy(run)]
 
     @property
+    def finals(self) -> dict[str, tuple[Interval, str]]:
+        """arm -> the mean return of its final games, over seeds, and how many games of how many seeds.
+
+        Of runs that have played them.
+        """
+        found = {}
+        for arm, runs in collect.grouped(self.sound).get(self.name, {}).items():
+            rows = [row for run in runs for row in run.rows if row["kind"] == "final"]
+            if rows:
+                means = {self.name: np.array([row[collect.FINAL] for row in rows], float)}
+                games = " or ".join(map(str, sorted({row.get("final/games", "?") for row in rows})))
+                steps = " or ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
+                told = f"{games} games of each of {len(rows)} seeds after {steps} env steps"
+                found[arm] = statistics.estimate(statistics.mean, means), told
+        return found
+
+    @property
     def left_out(self) -> list[str]:
         """A line for each arm of which seeds are not compared."""
         whys: dict[str, dict[int, str]] = {arm: {} for arm in self.runs}
@@ -113,11 +130,13 @@ def reached_step(run: RunData) -> int:
 def finished(run: RunData) -> bool:
     """Whether its last rows are there: those of its last env steps, or of the return that ends a run.
 
-    Not where it ended with an error all the same.
+    Behind them is that of the final games, where it plays any. Not where it ended with an error all the same.
     """
     config = run.config
     if run.failed:
         return False
+    if config.final_games and has_policy(run):
+        return run.rows[-1:] != [] and run.rows[-1]["kind"] == "final"
     steps, returns = collect.steps_and_returns(run)
     if config.stop_at_return is not None and (returns >= config.stop_at_return).any():
         return True
@@ -247,7 +266,7 @@ def value_of(run: RunData, row: Mapping[str, Any], key: str) -> float | None:
 
 
 def as_csv(runs: Sequence[RunData]) -> str:
-    """Every row of all runs: game, arm, seed, kind ("train" or "eval"), env_step, and a column a number.
+    """Every row of all runs: game, arm, seed, kind ("train", "eval", "final"), env_step, a column a number.
 
     Lists (the returns of single games, drift) are left out. What a row does not have is empty.
     """

@@ -5,27 +5,55 @@ run has the link's name. Runs may be packed, see `packing`. Imports no jax.
 """
 
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from srl_jax import statistics
+from srl_jax import checks, specs, statistics
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.data import Published, ReferencePolicy
 from srl_jax.errors import ConfigError
-from srl_jax.modes import MODES
+from srl_jax.learning.modes import MODES
 
 from .. import packing
 from .run_data import RunData, arm_name, in_order, load_run, run_directories
 
 RETURN = "eval/return_mean"
 """The key of learning curves."""
-PROTOCOL = ("sticky_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps")
+FINAL = "final/return_mean"
+"""The key of the games after the last env step."""
+PROTOCOL = (
+    "sticky_actions", "full_actions", "life_loss", "noop_max", "eps_eval", "eval_games", "eval_max_steps",
+)  # fmt: skip
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
 OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", "loggers")
 """Fields in which runs of one arm and game may differ."""
+
+
+def settings(config: Config) -> Iterator[tuple[str, str, str, Any]]:
+    """(field, row, option, value) of all that a configuration says, but for its game and seed.
+
+    Of --rl, --encoder and the objectives, first the names of their rows are a value, and then each option of
+    each row is one, as text. Elsewhere row and option are "".
+    """
+    for field in INFOS:
+        value = getattr(config, field)
+        if field in ("rl", "encoder", "objectives"):
+            rows = []
+            for text in (value,) if isinstance(value, str) else value:
+                try:
+                    rows.append(specs.split(text))
+                except specs.SpecError:
+                    rows.append((text, {}))
+            yield field, "", "", " + ".join(name for name, _ in rows) or "none"
+            for row, options in rows:
+                for option, text in options.items():
+                    yield field, row, option, text
+        elif field not in ("game", "seed"):
+            yield field, "", "", value
 
 
 def load_runs(*roots: str | Path) -> list[RunData]:
@@ -192,18 +220,20 @@ def check_arms(runs: Sequence[RunData]) -> None:
     for game, arms in grouped(runs).items():
         for arm, members in arms.items():
             for run in members[1:]:
-                if differing := difference(members[0].config, run.config, names):
+                one, other = (checks.run_of(x.config).in_force() for x in (members[0], run))
+                if differing := difference(one, other, names):
                     raise ConfigError(
                         f"{run.path}: of the same arm, {arm} on {game}, as {members[0].path}, but {differing}"
                     )
 
 
-def check_protocols(runs: Sequence[RunData], *, force: bool = False) -> list[str]:
+def check_protocols(runs: Sequence[RunData], *, force: bool = False, more: Sequence[str] = ()) -> list[str]:
     """Whether returns of these runs mean the same: one protocol for each game.
 
     Args:
         runs: those without a policy's returns do not count.
         force: say what differs, and do not refuse.
+        more: fields beside `PROTOCOL` that must be the same.
 
     Returns:
         A line for each run whose protocol is not that of the game's first.
@@ -217,7 +247,7 @@ def check_protocols(runs: Sequence[RunData], *, force: bool = False) -> list[str
         if not len(steps_and_returns(run)[0]):
             continue
         reference = first.setdefault(run.game, run)
-        if differing := difference(reference.config, run.config, PROTOCOL):
+        if differing := difference(reference.config, run.config, (*PROTOCOL, *more)):
             found.append(f"{run.path}: another protocol than {reference.path}: {differing}")
     if found and not force:
         raise ConfigError(f"{found[0]}; --force compares them all the same")
@@ -249,6 +279,8 @@ def differs(
             names = ("sticky_actions", "noop_max", "eval_max_steps")
             pairs = {name.replace("_", " "): (getattr(score, name), getattr(config, name)) for name in names}
             compared = {name: pair for name, pair in pairs.items() if pair[0] is not None}
+            if config.full_actions and score.sticky_actions is not None:
+                more = ["the actions that the game knows (here all 18)"]
     else:
         if score.env_steps is not None:
             compared["env steps"] = score.env_steps, config.steps if env_steps is None else env_steps

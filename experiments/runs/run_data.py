@@ -48,6 +48,16 @@ class RunData(NamedTuple):
         """Whether it ended with an error, and is not under way."""
         return self.ended is not None and self.ended.failed
 
+    @property
+    def over(self) -> bool:
+        """Whether it says how it ended, or has all its env steps: earlier versions wrote no ended.json.
+
+        These had no final games, which a run with all its env steps may still be playing.
+        """
+        if self.ended is not None or self.config.final_games:
+            return self.ended is not None
+        return bool(self.rows) and self.rows[-1]["env_steps"] >= self.config.steps
+
 
 def in_order(runs: Iterable[RunData]) -> list[RunData]:
     """Runs by game, arm and seed."""
@@ -166,12 +176,13 @@ def check_rows(rows: list[dict], name: str) -> None:
             raise ConfigError(f"{name}, line {number}: env_steps is no count")
         for key, value in row.items():
             kind = key.partition("/")[0]
-            if key in ("eval/returns", STEPS):
+            if key in ("eval/returns", "final/returns", STEPS):
                 good = isinstance(value, list) and all(map(_is_count if key == STEPS else _is_number, value))
             elif kind == "diag" and isinstance(value, list):
                 good = all(map(_is_number, value))
             else:
-                drawn = kind in ("loss", "grad_norm", "diag") or key == "eval/return_mean"
+                means = ("eval/return_mean", "final/return_mean")
+                drawn = kind in ("loss", "grad_norm", "diag") or key in means
                 good = not drawn or _is_number(value)
             if not good:
                 raise ConfigError(f"{name}, line {number}: {key} is not made of numbers of single precision")

@@ -3,15 +3,16 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from absl import flags
 
-from srl_jax.config import Config, difference
+from srl_jax.config import INFOS, Config, difference
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files.reading import parse_json, read_bytes, replace_text
+from srl_jax.needs import Unread
 
 from ..command_line import flags as config_flags
 from .plan import Planned, settings
@@ -75,36 +76,53 @@ def write(root: Path, entries: Mapping[str, Entry]) -> None:
 def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
     """{name: the run with the configuration that it will write into its config.json}; imports jax.
 
+    A flag that all runs have need not be read by each of them: those that do not read it go without.
+
     Raises:
-        ConfigError: a run's flags are not valid, or it cannot start from the runs that it names.
+        ConfigError: a run's flags are not valid, or it cannot start from the runs that it names, or nothing
+            reads one of them.
     """
     if "jax" not in sys.modules:  # this process shall take no GPU, and those of the runs may
         import jax
 
         jax.config.update("jax_platforms", "cpu")
-    from srl_jax.training import resolved
-
     from ..train import check_extras
 
+    everywhere = set.intersection(*(set(run.flags.items()) for run in runs)) if runs else set()
+    without: dict[str, list[ConfigError]] = {}
     entries: dict[str, Entry] = {}
-    known: dict[Config, Config] = {}  # what differs by the seed alone is resolved once
+    known: dict[Any, Config] = {}  # what differs by the seed alone is resolved once
     for run in runs:
-        try:
-            config = parsed(run)
-            key = dataclasses.replace(config, seed=0)
-            if key not in known:
-                check_extras(config)
-                known[key] = resolved(key)
-            entries[run.name] = Entry(run, dataclasses.replace(known[key], seed=config.seed))
-        except ConfigError as error:
-            raise ConfigError(f"{run.name}: {error}") from None
+        while run.name not in entries:
+            try:
+                entries[run.name] = Entry(run, _config(run, known, check_extras))
+            except Unread as error:
+                flag = INFOS[error.field].flag or error.field
+                without.setdefault(flag, []).append(ConfigError(f"{run.name}: {error}"))
+                if (flag, run.flags.get(flag)) not in everywhere or len(without[flag]) == len(runs):
+                    raise without[flag][0] from None
+                run = run._replace(flags={name: x for name, x in run.flags.items() if name != flag})
+            except ConfigError as error:
+                raise ConfigError(f"{run.name}: {error}") from None
     for entry in entries.values():
         _check_sources(entry, entries)
     return entries
 
 
-def parsed(run: Planned) -> Config:
-    """The configuration of a run's command line, not yet resolved.
+def _config(run: Planned, known: dict[Any, Config], check: Callable[[Config], None]) -> Config:
+    """A run's configuration, resolved; `known` has those of the runs before it, but for the seed."""
+    from srl_jax.training import resolved
+
+    config, given = parsed(run)
+    key = dataclasses.replace(config, seed=0), frozenset(given)
+    if key not in known:
+        check(config)
+        known[key] = resolved(*key)
+    return dataclasses.replace(known[key], seed=config.seed)
+
+
+def parsed(run: Planned) -> tuple[Config, set[str]]:
+    """The configuration of a run's command line, not yet resolved, and what that gives.
 
     Raises:
         ConfigError: a flag is unknown or its value is not valid.
@@ -118,7 +136,7 @@ def parsed(run: Planned) -> Config:
         raise ConfigError(f"--{error.flagname}: {config_flags.unknown(error.flagname, values)}") from None
     except (flags.Error, ValueError) as error:
         raise ConfigError(str(error).removeprefix("flag ")) from None
-    return config_flags.config_from_flags(values)
+    return config_flags.config_from_flags(values), config_flags.what_is_given(values)
 
 
 def _check_sources(entry: Entry, entries: Mapping[str, Entry]) -> None:

@@ -66,7 +66,7 @@ def given_flags(values: flags.FlagValues) -> dict[str, str | tuple[str, ...]]:
     """The flags of training that were given, as texts; `plan.plan` refuses those that it gives each run."""
     names = [info.flag or name for name, info in INFOS.items()]
     found: dict[str, str | tuple[str, ...]] = {}
-    for name in (*names, "preset", "config", "tune_runtime"):
+    for name in (*names, "preset", "protocol", "config", "tune_runtime"):
         if values[name].present:
             value = values[name].value
             text = tuple(value) if isinstance(value, list) else "off" if value is None else value_text(value)

@@ -1,4 +1,6 @@
-"""How far a run is, as its directory says, and whether it failed, as its log does. Imports no jax.
+"""How far a run is, as its directory says, and whether it failed, as its log does.
+
+Imports no jax, but where a run is of an earlier version, to see what its configuration means.
 
 ROOT/logs/NAME.log has what the run's processes printed, and lines of the sweep. It decides nothing: what is
 left to do, the run's directory says.
@@ -7,11 +9,11 @@ left to do, the run's directory says.
 import os
 import re
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax.config import INFOS, Config, another_run, difference
+from srl_jax.config import INFOS, Config, difference
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files import checkpoint, resuming, rundir
 from srl_jax.files.checkpoint import NUMBERS, PARAMS
@@ -53,7 +55,7 @@ def look(path: Path, config: Config) -> State:
         raise ConfigError(f"{path}: {error.strerror}") from None
     if not blank:
         names = [name for name in INFOS if name not in ("imports", "loggers")]  # may be others by now
-        if differing := difference(Config.load(path), config, names):
+        if differing := _alike(difference, Config.load(path), config, names):
             raise ConfigError(
                 f"{path}: the run there has another configuration: {differing}; give the flags that it was "
                 "run with, another --out, or move it away"
@@ -70,10 +72,19 @@ def look(path: Path, config: Config) -> State:
         return State("resumable")  # from an older one, or not begun: the run itself finds out
     ended = ending.read(path)
     over = NUMBERS not in found.files or (ended is not None and ended.status == "finished")  # --keep_replay
-    if not over or another_run(found.config, config):
+    if not over or _alike(resuming.another_run, found.config, config):
         return State("resumable", found.env_steps)
     lacks = _lacks(path, found)
     return State("resumable" if lacks else "done", found.env_steps, lacks)
+
+
+def _alike(differing: Callable[..., str], there: Config, here: Config, *names: Iterable[str]) -> str:
+    """What differs of what two configurations mean; where the texts are the same, that takes no jax."""
+    if not differing(there, here, *names):
+        return ""
+    from srl_jax.training import completed
+
+    return differing(completed(there), completed(here), *names)
 
 
 def holder(error: ConfigError) -> str:

@@ -7,13 +7,13 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from srl_jax import weights
 from srl_jax.augment import UNCHANGED, Views
-from srl_jax.latents import make_encoder_gradient
-from srl_jax.modes import Mode
-from srl_jax.optim import ENCODER, RL
+from srl_jax.learning import weights
+from srl_jax.learning.latents import make_encoder_gradient
+from srl_jax.learning.modes import Mode
+from srl_jax.learning.optim import ENCODER, RL
+from srl_jax.learning.update import Hyper
 from srl_jax.types import Array, Encoder, Latents, Objective, Params, TrainState, Window
-from srl_jax.update import Hyper
 from srl_jax.window import stack_last
 
 
@@ -50,7 +50,7 @@ def make_functions(
     channels: int,
     views: Views = UNCHANGED,
 ) -> Functions:
-    """The functions of an agent; C is `channels`, `views` as of `srl_jax.update.make_update`."""
+    """The functions of an agent; C is `channels`, `views` as of `srl_jax.learning.update.make_update`."""
     decode = {name: _decode(name, objective) for name, objective in objectives.items() if objective.image}
     ready = {n: f for n, f in decode.items() if _enough(f, n, objectives, encoder, channels)}
     groups = {ENCODER, *ready, *(group for name in ready for group in objectives[name].reads)}

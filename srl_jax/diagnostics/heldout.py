@@ -48,8 +48,8 @@ class HeldOut(NamedTuple):
 def collect(config: Config, horizon: int) -> HeldOut:
     """Plays a random policy in environments of their own, and keeps some of what it saw.
 
-    Which observations these are depends on the game and its protocol (sticky actions, no-ops, size and number
-    of frames), and on nothing else.
+    Which observations these are depends on the game and its protocol (sticky actions, set of actions, no-ops,
+    size and number of frames), and on nothing else.
 
     Args:
         config: a run's.
@@ -58,13 +58,20 @@ def collect(config: Config, horizon: int) -> HeldOut:
     Returns:
         Arrays that nobody may write to: seeds of one process share them.
     """
-    protocol = config.game, config.frame_size, config.frame_stack, config.sticky_actions, config.noop_max
-    return _collect(*protocol, horizon, WINDOWS)
+    names = ("game", "frame_size", "frame_stack", "sticky_actions", "full_actions", "noop_max")
+    return _collect(*(getattr(config, name) for name in names), horizon, WINDOWS)
 
 
 @functools.lru_cache(maxsize=1)
 def _collect(
-    game: str, size: int, stack: int, sticky_actions: float, noop_max: int, horizon: int, number: int
+    game: str,
+    size: int,
+    stack: int,
+    sticky_actions: float,
+    full_actions: bool,
+    noop_max: int,
+    horizon: int,
+    number: int,
 ) -> HeldOut:
     steps = number * STRIDE // ENVS
     env = envs.make(
@@ -73,6 +80,7 @@ def _collect(
         seed=seed_for(SEED, "held out", "environments"),
         frame_size=size,
         sticky_actions=sticky_actions,
+        full_actions=full_actions,
         noop_max=noop_max,
         with_state=True,
     )

@@ -16,10 +16,10 @@ from srl_jax.diagnostics.functions import Functions
 from srl_jax.diagnostics.heldout import HeldOut, collect
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
+from srl_jax.learning.update import Hyper
 from srl_jax.replay import Replay
 from srl_jax.run.actor import seed_for
 from srl_jax.types import Params, TrainState, Window
-from srl_jax.update import Hyper
 
 BATCH = 32
 """Observations that are encoded or decoded in one call."""

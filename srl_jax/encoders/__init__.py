@@ -13,6 +13,7 @@ from srl_jax.encoders.impala import impala
 from srl_jax.encoders.lix import MOST, Mixing
 from srl_jax.encoders.options import End, Start, with_options
 from srl_jax.plugins import Registry
+from srl_jax.specs import needs
 from srl_jax.types import Encoder
 
 __all__ = [
@@ -70,6 +71,7 @@ LIX_GOAL = 0.75
 
 
 @with_options
+@needs(lix_goal="lix!=0")
 def a_lix(
     observation_shape: tuple[int, int, int],
     start: Start,
@@ -92,13 +94,10 @@ def a_lix(
         lix_goal: the discontinuity of the gradient that S is tuned to; 0 lets S stay as it is.
 
     Raises:
-        ValueError: where an option is out of range or the frames are too small, or there is a goal without
-            LIX layers.
+        ValueError: where an option is out of range or the frames are too small.
     """
     if lix > MOST:
         raise ValueError(f"lix must be at most {MOST:g}")
-    if not lix and lix_goal != LIX_GOAL:
-        raise ValueError("with lix=0 nothing reads lix_goal; give lix, say lix=1, or leave lix_goal out")
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1)]
     mixing = Mixing(lix, lix_goal) if lix else None
     return convolutional_encoder(observation_shape, layers, start, end, features=features, lix=mixing)
@@ -126,6 +125,7 @@ def mrq(observation_shape: tuple[int, int, int], start: Start, end: End, *, feat
 
 
 @with_options
+@needs(layer_norm="features!=0,end=default")
 def sac_ae(
     observation_shape: tuple[int, int, int],
     start: Start,
@@ -141,11 +141,8 @@ def sac_ae(
         layer_norm: LayerNorm before the tanh of the default end (in the thesis' code, not in its text).
 
     Raises:
-        ValueError: where an option is out of range or the frames are too small, or `layer_norm=false` is
-            beside another end.
+        ValueError: where an option is out of range or the frames are too small.
     """
-    if not layer_norm and end.end != "default":
-        raise ValueError(f"layer_norm=false is of the default end; leave it out beside end={end.end}")
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
     own_end = "layer_norm_tanh" if layer_norm else "tanh"
     return convolutional_encoder(observation_shape, layers, start, end, features=features, own_end=own_end)

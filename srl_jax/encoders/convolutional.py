@@ -13,7 +13,7 @@ from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.lix import Mixing, mixed, tuned
 from srl_jax.encoders.options import End, Latent, Start
 from srl_jax.layers import Conv, ConvTranspose, Pads
-from srl_jax.optim import ENCODER
+from srl_jax.learning.optim import ENCODER
 from srl_jax.specs import check_choice
 from srl_jax.types import Array as AnyArray
 from srl_jax.types import Decoder, Encoder, Params

@@ -162,12 +162,14 @@ def with_options(factory: Callable[..., Encoder]) -> Callable[..., Encoder]:
         factory: (observation_shape, start, end, **options) -> Encoder.
 
     Raises:
-        ValueError: from the row, where a value of `Start` or `End` is out of range.
+        ValueError: from the row, where a value of `Start` or `End` is out of range, or the shape is none.
     """
     shape, _, _, *own = inspect.signature(factory).parameters.values()
 
     @functools.wraps(factory)
     def row(observation_shape: tuple[int, int, int], **options: Any) -> Encoder:
+        if len(observation_shape) != 3 or not all(side > 0 for side in observation_shape):
+            raise ValueError(f"observation_shape must be (H, W, S * C), not {observation_shape}")
         start = Start(**{name: options.pop(name) for name in Start._fields if name in options})
         end = End(**{name: options.pop(name) for name in End._fields if name in options})
         check_choice("init", start.init, INITIALISERS)

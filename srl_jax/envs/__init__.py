@@ -51,6 +51,7 @@ def make(
     seed: int,
     frame_size: int = 84,
     sticky_actions: float = 0.0,
+    full_actions: bool = False,
     noop_max: int = 30,
     max_frames: int = MAX_FRAMES,
     reseed_every: int = 5_000,
@@ -67,7 +68,7 @@ def make(
         seed: the source of all randomness; different seeds share no environment.
         frame_size: height and width of a frame in pixels; for Catch 84 or 42.
         sticky_actions: probability of repeating the last action, per emulator frame.
-        noop_max: see `atari.Atari`.
+        full_actions, noop_max: see `atari.Atari`.
         max_frames: emulator frames (4 per env step) after which an episode is truncated.
         reseed_every: env steps between two seeded resets of one environment, see `atari.Atari`.
         with_state: `info["state"]` also where it takes time to know it: see `ram.AtariWithState`.
@@ -82,6 +83,7 @@ def make(
     """
     given = {
         "sticky_actions": sticky_actions,
+        "full_actions": full_actions,
         "noop_max": noop_max,
         "max_frames": max_frames,
         "reseed_every": reseed_every,

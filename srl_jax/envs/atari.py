@@ -60,6 +60,7 @@ class Atari(FrameVectorEnv):
         seed: int,
         frame_size: int = 84,
         sticky_actions: float = 0.0,
+        full_actions: bool = False,
         noop_max: int = 30,
         max_frames: int = MAX_FRAMES,
         reseed_every: int = 5_000,
@@ -72,6 +73,8 @@ class Atari(FrameVectorEnv):
             seed: the source of all randomness.
             frame_size: height and width of a frame in pixels.
             sticky_actions: probability of repeating the last action, per emulator frame.
+            full_actions: all 18 actions of the joystick, FIRE among them, instead of those that the game
+                knows.
             noop_max: an episode starts with a random number of no-ops below this (the FIRE counts
                 as one); 0 and 1 mean none.
             max_frames: emulator frames after which an episode is truncated.
@@ -101,7 +104,7 @@ class Atari(FrameVectorEnv):
             thread_affinity_offset=-1,
             max_num_frames_per_episode=max_frames,
             repeat_action_probability=sticky_actions,
-            full_action_space=False,
+            full_action_space=full_actions,
             continuous=False,
             # ALE has no mode without autoreset. In this one it would come a step late, and `step`
             # refuses to go on before an ended environment has been reset, so it never comes.

@@ -120,7 +120,7 @@ def atari(*, game: str = "Pong") -> Game:
                 "Atari needs ale-py, pip install 'srl-jax[atari]'; valid without it: Catch, CatchDistractor"
             )
 
-    options = ("sticky_actions", "noop_max", "max_frames", "reseed_every", "with_state")
+    options = ("sticky_actions", "full_actions", "noop_max", "max_frames", "reseed_every", "with_state")
     return Game(make, check, options, frames_per_step=FRAME_SKIP, lives=True)
 
 

@@ -4,6 +4,8 @@ A second emulator is kept in step with one environment of `atari.Atari`: the sam
 of episodes, the same actions. That they are in step is checked, not believed.
 """
 
+from typing import Any
+
 import ale_py
 import numpy as np
 from ale_py import roms
@@ -26,15 +28,15 @@ class Twin:
 
     Args:
         game: one of `games.ATARI_57`.
-        sticky_actions, noop_max: the environment's.
+        sticky_actions, full_actions, noop_max: the environment's.
     """
 
-    def __init__(self, game: str, *, sticky_actions: float, noop_max: int):
+    def __init__(self, game: str, *, sticky_actions: float, noop_max: int, full_actions: bool = False):
         ale_py.ALEInterface.setLoggerMode(ale_py.LoggerMode.Error)
         self._ale = ale_py.ALEInterface()
         self._ale.setFloat("repeat_action_probability", sticky_actions)
         self._rom = str(roms.get_rom_path(rom_name(game)))
-        self._noop_max = noop_max
+        self._full_actions, self._noop_max = full_actions, noop_max
         self._draws = np.random.RandomState()
 
     def reset(self, ale_seed: int | None) -> None:
@@ -47,7 +49,7 @@ class Twin:
         if ale_seed is not None:
             ale.setInt("random_seed", ale_seed)
             ale.loadROM(self._rom)
-            self._actions = ale.getMinimalActionSet()
+            self._actions = ale.getLegalActionSet() if self._full_actions else ale.getMinimalActionSet()
             self._draws = np.random.RandomState(ale_seed)  # a Mersenne twister, seeded as C++'s mt19937
         ale.reset_game()
         # How libstdc++ makes a number below noop_max of 32 random bits.
@@ -107,16 +109,29 @@ class AtariWithState(Atari):
 
     Args:
         game: one of `games.ATARI_57`; one that nobody has labelled has no state.
-        sticky_actions, noop_max: as of `atari.Atari`.
+        sticky_actions, full_actions, noop_max: as of `atari.Atari`.
         **options: the others of `atari.Atari`.
     """
 
-    def __init__(self, game: str, *, sticky_actions: float = 0.0, noop_max: int = 30, **options):
-        super().__init__(game, sticky_actions=sticky_actions, noop_max=noop_max, **options)
+    def __init__(
+        self,
+        game: str,
+        *,
+        sticky_actions: float = 0.0,
+        full_actions: bool = False,
+        noop_max: int = 30,
+        **options,
+    ):
+        shared: dict[str, Any] = {
+            "sticky_actions": sticky_actions,
+            "full_actions": full_actions,
+            "noop_max": noop_max,
+        }
+        super().__init__(game, **shared, **options)
         labels = ram_labels(game)
         self.state_names, self._bytes = tuple(labels), list(labels.values())
         made = self.num_envs if labels else 0
-        self._twins = [Twin(game, sticky_actions=sticky_actions, noop_max=noop_max) for _ in range(made)]
+        self._twins = [Twin(game, **shared) for _ in range(made)]
         self._turn = 0
 
     def _reset(self, mask, seeded):

@@ -24,7 +24,8 @@ from srl_jax.plugins import Registry
 from srl_jax.specs import parse
 
 FILE = "loggers.json"
-"""In a run directory: {logger: how many rows of metrics.jsonl it has been given}."""
+"""In a run directory: {logger: how many rows of metrics.jsonl it has been given}, without final ones, of
+which "LOGGER final" has the env step of the last, and one."""
 WRITTEN = (FILE, "metrics.csv", "tensorboard", "wandb")
 """What this module writes into a run directory."""
 
@@ -94,11 +95,12 @@ class TensorBoard:
         self._events.flush()
 
     def hyperparameters(self, config: Mapping[str, Any]) -> None:
-        """Writes what the HParams tab shows, beside the last evaluation."""
+        """Writes what the HParams tab shows, beside the last evaluation and the final one."""
         from tensorboardX.summary import hparams
 
         texts = {name: x if isinstance(x, bool | int | float) else str(x) for name, x in config.items()}
-        for summary in hparams(texts, {"eval/return_mean": None}):
+        kinds = ("eval", "final") if config.get("final_games") else ("eval",)
+        for summary in hparams(texts, {f"{kind}/return_mean": None for kind in kinds}):
             self._events.file_writer.add_summary(summary)
 
     def picture(self, key: str, env_step: int, array: np.ndarray) -> None:
@@ -262,10 +264,13 @@ class Loggers:
         """
         for row in rows:
             numbers = {key: x for key, x in row.items() if isinstance(x, int | float) and key != "env_steps"}
-            lack = [text for text in self._loggers if self._had.get(_key(text), 0) <= self._rows]
-            self._rows += 1
+            place, kind = self._rows, ""
+            if row.get("kind") == "final":  # counted apart: an extended run has another row in its place
+                place, kind = row["env_steps"], " final"
+            lack = [text for text in self._loggers if self._had.get(_key(text) + kind, 0) <= place]
+            self._rows += not kind
             self._each("row", row["env_steps"], numbers, among=lack)
-            self._had |= {_key(text): self._rows for text in lack if text in self._loggers}
+            self._had |= {_key(text) + kind: place + 1 for text in lack if text in self._loggers}
         if self._loggers:
             with saving(self._path):
                 replace_text(self._path, json.dumps(self._had) + "\n")

@@ -1,17 +1,30 @@
 """Where a run is resumed from, and whether what lies in a directory is a run at all. Imports no jax."""
 
 import contextlib
+import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from srl_jax import config
-from srl_jax.config import MAY_CHANGE, SOURCES, Config, another_run
+from srl_jax.config import SOURCES, Config, difference
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files import checkpoint, display, loggers, provenance, rundir
 from srl_jax.files.checkpoint import Manifest
 from srl_jax.files.metrics import read_metrics
 from srl_jax.files.reading import read_json
 from srl_jax.run import ending
+
+ENDS = ("steps", "stop_at_return")
+"""Fields that say when a run ends."""
+MAY_CHANGE = (*ENDS, "keep_replay", "keep_best", "imports", "loggers")
+"""Fields that may change when a run is resumed: when it ends, what it leaves, its plug-ins and loggers."""
+
+
+def another_run(there: Config, here: Config) -> str:
+    """`difference` of what makes two runs two: neither `MAY_CHANGE` nor where the sources lie by now."""
+    same = {name: getattr(there, name) for name in SOURCES if getattr(there, name) and getattr(here, name)}
+    same |= {name: getattr(there, name) for name in MAY_CHANGE}
+    return difference(there, dataclasses.replace(here, **same))
 
 
 def say(line: str) -> None:
@@ -217,9 +230,27 @@ def all_to_resume(
                         f"{manifest.env_steps} env steps; --overwrite would start all of them anew"
                     )
             return [None] * len(runs)
-        if len(set(steps)) == 1:
+        # One that has ended, before the others had, can be resumed from its checkpoint before.
+        ended = {checkpoint.NUMBERS not in manifest.files for manifest in found if manifest is not None}
+        if len(set(steps)) == len(ended) == 1:
             return found
-        at_most = min(steps)
+        at_most = min(steps) - (len(set(steps)) == 1)
+
+
+def has_ended(path: Path, manifest: Manifest, wanted: Config) -> bool:
+    """Whether a run has done all that is wanted of it, so that there is nothing to resume.
+
+    Args:
+        path: its directory.
+        manifest: of its newest checkpoint, see `to_resume`.
+        wanted: its configuration, now.
+    """
+    if checkpoint.NUMBERS not in manifest.files:
+        return True
+    if manifest.env_steps < wanted.steps:
+        return False
+    ended = ending.read(path)  # a run of --keep_replay
+    return ended is not None and ended.status == "finished"
 
 
 def first_checkpoint(wanted: Config) -> int:

@@ -7,10 +7,10 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from srl_jax.learning.update import ema, periodic
 from srl_jax.objectives.networks import DISTANCES, MLP, functions, join, one_hot
-from srl_jax.specs import check_choice, check_size
+from srl_jax.specs import check_choice, check_size, needs
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
-from srl_jax.update import ema, periodic
 
 Rule: TypeAlias = Callable[[Params, Params, Array], Params]
 TARGETS = ("slow", "periodic", "stopped", "gradient")
@@ -33,6 +33,7 @@ class LatentDynamics(nn.Module):
         return z + step if self.residual else step
 
 
+@needs(tau="target=slow", every="target=periodic")
 def forward_latent(
     context: Context,
     *,
@@ -61,7 +62,7 @@ def forward_latent(
             1); "stopped", the online encoder's, without gradient; "gradient", the online encoder's with
             gradient, whose least loss is where all latents are the same: it is there to show that they
             collapse.
-        tau: of the slow copy, see `srl_jax.update.ema`.
+        tau: of the slow copy, see `srl_jax.learning.update.ema`.
         every: k of the periodic one, in updates.
 
     Raises:

@@ -4,10 +4,10 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.augment import make_view
+from srl_jax.learning.update import ema
 from srl_jax.objectives.networks import MLP, functions, masked_mean, unit
 from srl_jax.specs import check_choice, check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
-from srl_jax.update import ema
 from srl_jax.window import only
 
 SIMILARITIES = ("bilinear", "cosine")
@@ -47,7 +47,7 @@ def infonce(
         similarity: "bilinear", `p W p'` with a W that starts as the identity, or "cosine".
         temperature: what similarities are divided by.
         view: see `srl_jax.augment.make_view`.
-        tau: of the slow copies, see `srl_jax.update.ema`.
+        tau: of the slow copies, see `srl_jax.learning.update.ema`.
 
     Raises:
         ValueError: where an option is out of range.

@@ -3,9 +3,9 @@
 import jax
 import jax.numpy as jnp
 
-from srl_jax.specs import check_choice
+from srl_jax.learning.update import ema
+from srl_jax.specs import check_choice, needs
 from srl_jax.types import Array, Context, Latents, Objective, Window
-from srl_jax.update import ema
 
 TARGETS = ("zero", "slow")
 
@@ -25,6 +25,7 @@ def l2_norm(z: Array) -> jax.Array:
 NORMS = {"half_squared": half_squared_norm, "l2": l2_norm}
 
 
+@needs(tau="target=slow")
 def latent_l2(
     context: Context,
     *,
@@ -41,7 +42,7 @@ def latent_l2(
         norm: "half_squared", half the squared length of what separates them, or "l2", its length.
         target: "zero", or "slow", the latent of a slow copy of the encoder: against its drift (thesis,
             section 6.4).
-        tau: of the slow copy, see `srl_jax.update.ema`.
+        tau: of the slow copy, see `srl_jax.learning.update.ema`.
 
     Raises:
         ValueError: where an option is out of range.

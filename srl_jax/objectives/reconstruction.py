@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.objectives.networks import unit
-from srl_jax.specs import check_size
+from srl_jax.specs import check_size, needs
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.window import image, to_unit
 
@@ -98,6 +98,7 @@ def spectrally_normalised(params: Params) -> Params:
     return jax.tree.map(normalised, params)
 
 
+@needs(patch="masked!=0")
 def reconstruction(
     context: Context,
     *,

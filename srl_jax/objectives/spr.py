@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.layers import Conv, Dense, min_max
+from srl_jax.learning.update import ema
 from srl_jax.objectives.networks import cosine_distance, functions, one_hot
-from srl_jax.specs import check_choice, check_size
+from srl_jax.specs import check_choice, check_size, needs
 from srl_jax.types import Array, Context, Latents, Layer, Objective, Params, Window
-from srl_jax.update import ema
 
 TARGETS = ("slow", "stopped")
 PROJECTIONS = ("own", "rl")
@@ -40,6 +40,7 @@ class Transition(nn.Module):
         return min_max(x.reshape(z.shape))
 
 
+@needs(hidden="projection=own", tau="target=slow", importance="RL is trained,rl:prioritized=true,rl:alpha!=0")
 def spr(
     context: Context,
     *,
@@ -68,13 +69,13 @@ def spr(
             layer, wherever the mode and the gate let it into the encoder.
         target: "slow", slow copies of encoder and projection (the paper's arm without augmentation);
             "stopped", the online ones without gradient (its arm with augmentation).
-        tau: of the slow copies, see `srl_jax.update.ema`.
+        tau: of the slow copies, see `srl_jax.learning.update.ema`.
         mask: whether steps behind the end of an episode count 0, as in the authors' code.
         importance: whether the loss is multiplied by replay's importance weights, as in the authors' code.
 
     Raises:
         ValueError: where an option is out of range, or with `projection=rl` RL's head is not trained or has
-            no such layer, or hidden is given.
+            no such layer.
     """
     check_size("steps", steps)
     check_size("hidden", hidden)
@@ -90,7 +91,7 @@ def spr(
         parts["projection"], project = functions(Dense(hidden), features)
         where, outputs, reads = "projection", hidden, {}
     else:
-        where, outputs, part, project = _rl_layer(context, hidden)
+        where, outputs, part, project = _rl_layer(context)
         reads = {where: part}
     parts["predictor"], predict = functions(Dense(outputs), outputs)
 
@@ -118,13 +119,11 @@ def spr(
     return Objective(init, loss, weight, horizon=steps, slow=slow, reads=reads)
 
 
-def _rl_layer(context: Context, hidden: int) -> Layer:
+def _rl_layer(context: Context) -> Layer:
     """The first layer of RL's head."""
     if context.rl_layer is None:
         raise ValueError(
             "projection=rl needs an RL head that is trained beside it and begins with a linear layer over "
             "the latent, as those of all rows but iqn do; give projection=own"
         )
-    if hidden != HIDDEN:
-        raise ValueError("with projection=rl the layer of RL's head has its own size; leave hidden out")
     return context.rl_layer

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.augment import make_view
+from srl_jax.learning.update import ema
 from srl_jax.objectives.networks import MLP, cosine_distance, functions
 from srl_jax.specs import check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
-from srl_jax.update import ema
 from srl_jax.window import only
 
 
@@ -41,7 +41,7 @@ def byol(
         hidden: width of the hidden layer of projection and predictor.
         outputs: size of a projection.
         view: see `srl_jax.augment.make_view`.
-        tau: of the slow copies, see `srl_jax.update.ema`.
+        tau: of the slow copies, see `srl_jax.learning.update.ema`.
 
     Raises:
         ValueError: where an option is out of range.

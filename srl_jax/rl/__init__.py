@@ -8,15 +8,15 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import jax
 
 from srl_jax.augment import make_view
+from srl_jax.learning.update import ema, periodic
 from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.learner import Munchausen, QLearner
 from srl_jax.rl.losses import n_step as n_step_view
 from srl_jax.rl.losses import n_step_one_early
 from srl_jax.rl.values import Values, categorical, implicit_quantile, normal_logits, quantile, scalar
-from srl_jax.specs import check_choice, check_size, option_defaults
+from srl_jax.specs import check_choice, check_size, needs, needs_of, option_defaults
 from srl_jax.types import Array, Context, Layer, Objective, Params
-from srl_jax.update import ema, periodic
 
 __all__ = ["REGISTRY", "register", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
 
@@ -57,6 +57,18 @@ class Algorithm(NamedTuple):
     first_layer: Layer | None = None
 
 
+@needs(
+    shared_hidden="dueling=true",
+    noisy_std="noisy=true",
+    prioritized="alpha!=0",
+    alpha="prioritized=true",
+    munchausen_alpha="munchausen=true",
+    munchausen_tau="munchausen=true",
+    munchausen_clip="munchausen=true",
+    copies="view!=none",
+    target_copies="view!=none",
+    slow_tau="slow=ema",
+)
 def q_learner(
     context: Context,
     values: Values,
@@ -101,12 +113,13 @@ def q_learner(
         munchausen_alpha, munchausen_tau, munchausen_clip: the share, the temperature, and the least bonus.
         view: what s_t and the state bootstrapped from are seen through, each by draws of its own; see
             `srl_jax.augment.make_view`. "none": as they are.
-        copies: K, the loss is a mean over so many views of s_t (Kostrikov et al. 2020, DrQ, section 3).
-        target_copies: M, the target is a mean over so many views of the state bootstrapped from.
+        copies: K, the loss is a mean over so many views of s_t (Kostrikov et al. 2020, DrQ, section 3);
+            without a view there is one.
+        target_copies: M, the target is a mean over so many views of the state bootstrapped from, likewise.
         slow: how the slow copies of encoder and head follow: "periodic", replaced after each
             --slow_update_every updates; "ema", a moving average; "none", the online ones without gradient
             take their place.
-        slow_tau: of the moving average, the share that stays in an update, see `srl_jax.update.ema`.
+        slow_tau: of the moving average, the share that stays in an update, see `srl_jax.learning.update.ema`.
         act_with: whether the "online" or the "slow" network acts, in training and in evaluations.
         target: the state bootstrapped from; "s_t+n-1" is a defect of the buffers of Dopamine's Atari 100k
             agents and of BBF, see `srl_jax.rl.losses.n_step_one_early` and docs/deviations.md.
@@ -125,14 +138,10 @@ def q_learner(
         ("slow", slow, SLOW), ("act_with", act_with, ACTORS), ("target", target, N_STEP_VIEWS),
     ):  # fmt: skip
         check_choice(option, value, choices)
-    if shared_hidden and not dueling:
-        raise ValueError("shared_hidden=true needs dueling=true; one stream has nobody to share with")
     if munchausen and double:
         raise ValueError("munchausen=true averages over actions and picks none; it needs double=false")
     if munchausen and not (munchausen_tau > 0 and munchausen_clip <= 0):
         raise ValueError("munchausen_tau must be above 0 and munchausen_clip at most 0")
-    if view == "none" and max(copies, target_copies) > 1:
-        raise ValueError("with view=none all copies are the same; give a view, say view=shift")
     if act_with == "slow" and slow == "none":
         raise ValueError("act_with=slow needs a slow network; slow=none has none")
     if target == "s_t+n-1" and n_step < 2:
@@ -148,7 +157,7 @@ def q_learner(
         values=values,
         network=QNetwork(
             context.num_actions, values.outputs, hidden, dueling, noisy, noisy_std, values.prior,
-            shared_hidden, values.taus.cosines,
+            shared_hidden and dueling, values.taus.cosines,
         ),
         features=context.features,
         step_view=N_STEP_VIEWS[target],
@@ -156,8 +165,8 @@ def q_learner(
         double=double,
         munchausen=Munchausen(munchausen_alpha, munchausen_tau, munchausen_clip) if munchausen else None,
         view=None if view == "none" else make_view(view),
-        copies=copies,
-        target_copies=target_copies,
+        copies=1 if view == "none" else copies,
+        target_copies=1 if view == "none" else target_copies,
         lagged=slow != "none",
     )  # fmt: skip
     return Algorithm(
@@ -170,6 +179,7 @@ def q_learner(
     )
 
 
+@needs(**dict.fromkeys(("atoms", "v_min", "v_max", "init_std", "priority"), "distributional=true"))
 def rainbow(
     context: Context,
     *,
@@ -194,20 +204,13 @@ def rainbow(
     Args:
         context: the latents below and the number of actions.
         distributional: the values are `srl_jax.rl.values.categorical`, C51; otherwise `scalar`.
-        atoms, v_min, v_max, init_std, priority: see `srl_jax.rl.values.categorical`; without a distribution
-            nothing reads them, and they must keep their defaults.
+        atoms, v_min, v_max, init_std, priority: see `srl_jax.rl.values.categorical`.
         double, dueling, noisy, prioritized, n_step, noisy_std, alpha, hidden, **options: see `q_learner`.
 
     Raises:
-        ValueError: as `q_learner` and `categorical` do; or distributional is false and an option describes
-            the distribution.
+        ValueError: as `q_learner` and `categorical` do.
     """
     kind = partial(categorical, atoms=atoms, v_min=v_min, v_max=v_max, init_std=init_std, priority=priority)
-    if not distributional:
-        defaults = option_defaults(categorical)
-        unread = [name for name, value in kind.keywords.items() if value != defaults[name]]
-        if unread:
-            raise ValueError(f"with distributional=false nothing reads {', '.join(unread)}; leave that out")
     return q_learner(
         context,
         kind() if distributional else scalar(),
@@ -224,15 +227,21 @@ def rainbow(
 
 
 def with_options_of(row: Callable[..., Algorithm], *functions: Callable) -> Callable[..., Algorithm]:
-    """The row, whose signature says that its options are those of these functions, as the first has them."""
+    """The row, whose signature says that its options are those of these functions, as the first has them.
+
+    An option needs all that any of the functions says it does.
+    """
     context = inspect.Parameter("context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
     options: dict[str, inspect.Parameter] = {}
+    merged: dict[str, str] = {}
     for function in functions:
+        for name, need in needs_of(function).items():
+            merged[name] = f"{merged[name]},{need}" if name in merged else need
         for name, parameter in inspect.signature(function).parameters.items():
             if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
                 options.setdefault(name, parameter)
     row.__dict__["__signature__"] = inspect.Signature([context, *options.values()])
-    return row
+    return needs(**merged)(row)
 
 
 def q_learner_of(kind: Callable[..., Values], **defaults: Any) -> Callable[..., Algorithm]:
@@ -251,7 +260,7 @@ def q_learner_of(kind: Callable[..., Values], **defaults: Any) -> Callable[..., 
     return partial(with_options_of(row, q_learner, kind), **defaults)
 
 
-with_options_of(rainbow, rainbow, q_learner)
+with_options_of(rainbow, rainbow, q_learner, categorical)
 REGISTRY = Registry(
     "rl",
     {

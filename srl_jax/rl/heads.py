@@ -6,7 +6,7 @@ import numpy as np
 from jax import Array
 
 from srl_jax.layers import Dense, NoisyDense, factorised_noise
-from srl_jax.optim import RL
+from srl_jax.learning.optim import RL
 from srl_jax.types import Array as AnyArray
 from srl_jax.types import Layer, Params
 

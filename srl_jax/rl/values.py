@@ -19,7 +19,7 @@ from srl_jax.rl.losses import (
     q_learning,
     quantile_q_learning,
 )
-from srl_jax.specs import check_size, choices_text
+from srl_jax.specs import check_size, choices_text, needs
 from srl_jax.types import Array
 
 PRIORITIES = ("cross_entropy", "kl", "batch_mean")
@@ -84,6 +84,7 @@ def scalar() -> Values:
     return Values(1, expected, loss, average_outputs)
 
 
+@needs(priority="prioritized=true,alpha!=0")
 def categorical(
     *,
     atoms: int = 51,

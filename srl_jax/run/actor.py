@@ -58,17 +58,18 @@ def make_env(config: Config, purpose: str, num_envs: int, *, seed: int | None = 
 
     Args:
         config: of the run.
-        purpose: a name, whose seeds are its own; in "eval" episodes may take `eval_max_steps`.
+        purpose: a name, whose seeds are its own; unless it is "train", episodes may take `eval_max_steps`.
         num_envs: how many.
         seed: of the environments; None for the run's own of that purpose.
     """
-    max_steps = config.eval_max_steps if purpose == "eval" else 0
+    max_steps = 0 if purpose == "train" else config.eval_max_steps
     return envs.make(
         config.game,
         num_envs=num_envs,
         seed=seed_for(config.seed, purpose, "environments") if seed is None else seed,
         frame_size=config.frame_size,
         sticky_actions=config.sticky_actions,
+        full_actions=config.full_actions,
         noop_max=config.noop_max,
         max_frames=max(envs.MAX_FRAMES, envs.FRAME_SKIP * max_steps),
     )

@@ -1,10 +1,12 @@
 """Evaluation of a policy: full games, with unclipped scores."""
 
+import time
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
+from srl_jax.files.display import Progress, hms
 from srl_jax.run.actor import FrameStack, Policy
 
 
@@ -85,3 +87,26 @@ def evaluate(
         told(step, played)
     seen = np.stack(recorded) if recorded else np.zeros((0, *shape), np.uint8)
     return Evaluation(returns.tolist(), lengths.tolist(), seen)
+
+
+def telling(progress: Progress, games: int, at_once: int, max_steps: int) -> Callable[[int, int], None]:
+    """What `evaluate` tells, shown: games, their rate and the time left, and env steps a second.
+
+    Until games have ended nobody knows how long they are, only how long they can be; that is shown then.
+
+    Args:
+        progress: counts games.
+        games: how many are played.
+        at_once: in how many environments.
+        max_steps: env steps after which a game is cut.
+    """
+    began, longest = time.monotonic(), -(-games // at_once) * max_steps
+
+    def told(steps: int, played: int) -> None:
+        seconds = time.monotonic() - began
+        unknown = steps >= 50 and played < games and (not played or games <= at_once)
+        at_most = f"{hms(seconds / steps * (longest - steps))} left" if unknown else None
+        fields = {"env steps": f"{steps * at_once:,}", "steps/s": f"{steps * at_once / seconds:,.0f}"}
+        progress.update(played, **fields, **{"at most": at_most})
+
+    return told

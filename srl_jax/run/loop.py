@@ -1,35 +1,36 @@
 """The host loop of one seed, or of several in step: act, step, add, sample, update; evaluate and checkpoint.
 
-The device's state has an axis of seeds (`srl_jax.agent.over_seeds`), and the host keeps a `Seed` for each.
-Threads act, step and reset the environments while the main thread has the device update. Both start from the
-parameters and the replay of the step before, and they meet before the next step. Evaluations have threads of
-their own and are awaited before the next row is written. So no result depends on timing.
+The device's state has an axis of seeds (`srl_jax.learning.agent.over_seeds`), and the host keeps a `Seed`
+for each. Threads act, step and reset the environments while the main thread has the device update. Both start
+from the parameters and the replay of the step before, and they meet before the next step. Evaluations have
+threads of their own and are awaited before the next row is written. So no result depends on timing.
 """
 
 import contextlib
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
+from concurrent import futures
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
-from srl_jax.agent import Agent, make_agent, over_seeds
 from srl_jax.config import Config
 from srl_jax.diagnostics.pictures import pictures
 from srl_jax.errors import ConfigError, Diverged, SaveError
-from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
+from srl_jax.learning.agent import Agent, make_agent, over_seeds
+from srl_jax.learning.resets import reset, reset_key
+from srl_jax.learning.update import NORM_EVERY, named_key
 from srl_jax.loading import given_policy, initial_params
-from srl_jax.resets import reset, reset_key
-from srl_jax.run import ending
+from srl_jax.run import ending, saving
 from srl_jax.run.actor import make_env, yielding_threads
 from srl_jax.run.ending import Ending
+from srl_jax.run.evaluations import FINAL, Evaluating
 from srl_jax.run.schedules import Now, Schedules, passed
 from srl_jax.run.seed import Seed
 from srl_jax.types import Params
-from srl_jax.update import NORM_EVERY, named_key
 
 FETCH_EVERY = 100
 """Updates after which their metrics are fetched from the device, so that few wait there between two rows."""
@@ -190,29 +191,33 @@ class Run:
                 drawn = pictures(self.agent, params, seed.replay, self.now.beta)
                 seed.report.pictures(self.env_steps, drawn)
                 counts = self.env_steps, self.updates, not finished, seed.saved and seed.saved.env_steps
-                results.append(Result(*counts, drawn, seed.recording))
+                results.append(Result(*counts, drawn, seed.evaluations.recording))
         return results
 
     def run(self) -> bool:
-        """To the last env step, or to the return that ends the run; False where it was told to stop."""
-        config, progress = self.config, self.seeds[0].report.progress
-        if self.seeds[0].saved is None:
+        """To the last env step, or to the return that ends the run, and the final evaluation behind it.
+
+        Returns:
+            Whether it got there; False where it was told to stop.
+        """
+        config, first = self.config, self.seeds[0]
+        if first.saved is None:
             self.begin()
             self.start_evaluation()
         else:
             for seed in self.seeds:
-                seed.play()
-        while self.env_steps < config.steps:
-            if self.stop():
-                self.save()
-                progress.note(f"stopped after {self.env_steps} env steps; a checkpoint is written")
+                seed.evaluations.play()
+        final = first.evaluations.final  # under way already, where it is resumed
+        while self.env_steps < config.steps and not final:
+            if self.stopped():
                 return False
-            before = self.env_steps
-            self.step()
             log, evaluate, save = (
-                passed(before, self.env_steps, every)
+                passed(self.env_steps, self.env_steps + config.num_envs, every)
                 for every in (config.log_every, config.eval_every, self.checkpoint_every)
             )
+            if (log or evaluate) and not self.played():  # its rows come before the next ones
+                return False
+            self.step()
             if (log or evaluate) and self.finish_evaluation():
                 break
             if log:
@@ -224,10 +229,45 @@ class Run:
                 self.start_evaluation()
             if save:  # last: a run that resumes from it does none of this again
                 self.save()
-            progress.update(self.env_steps)
+            first.report.progress.update(self.env_steps)
+        if not self.played():
+            return False
         self.finish_evaluation()
+        if not final:
+            self.start_final()
+            if not self.played():
+                return False
+            self.finish_evaluation()
         self.finish()
         return True
+
+    def stopped(self) -> bool:
+        """Whether it was told to stop; then a checkpoint is written."""
+        if self.stop():
+            self.save()
+            return True
+        return False
+
+    def played(self) -> bool:
+        """Waits for the games of the evaluation under way; False where it was told to stop instead."""
+        playing = [seed.evaluations.games for seed in self.seeds if seed.evaluations.games]
+        while futures.wait(playing, timeout=0.1).not_done:
+            if self.stopped():
+                return False
+        return True
+
+    def start_final(self) -> None:
+        """Has the policies of the end play the final games, if there are any.
+
+        A checkpoint comes behind. A run that is killed meanwhile resumes there, and so does one that is
+        extended, which therefore goes on without these games' rows.
+        """
+        if self.config.final_games and self.agent.mode.rl:
+            self.fetch()
+            for seed, state in self.each(self.state):
+                params = self.agent.acting(state)
+                seed.evaluations.start(Evaluating(params, self.env_steps, self.updates, {}, FINAL))
+            self.save()
 
     # A step
 
@@ -252,7 +292,7 @@ class Run:
         self.env_steps += self.config.num_envs
 
     def reset(self, number: int) -> None:
-        """The number-th reset of the run; see `srl_jax.resets`."""
+        """The number-th reset of the run; see `srl_jax.learning.resets`."""
         fresh = [self.agent.init(reset_key(seed.key, number), {}) for seed in self.seeds]
         self.state = reset(self.state, self.device.stack(fresh), self.config.reset, self.config.shrink)
         self.seeds[0].report.progress.note(f"reset {number} after {self.env_steps} env steps")
@@ -342,7 +382,7 @@ class Run:
         Returns:
             Whether all seeds have reached the return that ends the run.
         """
-        means = [seed.finish_evaluation(self.env_steps) for seed in self.seeds]
+        means = [seed.evaluations.finish(self.env_steps) for seed in self.seeds]
         wanted = self.config.stop_at_return
         return wanted is not None and min(means) >= wanted
 
@@ -370,5 +410,4 @@ class Run:
         for seed, params in self.each(self.agent.acting(self.state)):
             seed.save_parameters(params, self.env_steps, self.updates)
         for seed in self.seeds:  # until all have theirs, they can be resumed from the ones before
-            if seed.saved is not None and seed.saved.env_steps < self.env_steps:
-                checkpoint.slim(seed.saved)
+            saving.slim_before(seed.out, self.env_steps)

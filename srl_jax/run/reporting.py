@@ -18,7 +18,7 @@ from srl_jax.files.metrics import Mark, MetricsWriter, read_metrics
 from srl_jax.run.evaluate import Evaluation
 
 SOMETIMES = ("grad_norm/", "step_ratio/")
-"""How the names of metrics begin that only some updates measure; see `srl_jax.optim.NOT_MEASURED`."""
+"""How the names of metrics begin that only some updates measure: `srl_jax.learning.optim.NOT_MEASURED`."""
 
 
 class Means:
@@ -69,7 +69,8 @@ class Report:
     def __init__(self, out: Path, config: Config, *, progress: bool):
         self.path = Path(out or ".") / "metrics.jsonl"
         self._config = config
-        self.progress = Progress(config.steps, stream=None if progress else Display(None))
+        self._stream = None if progress else Display(None)
+        self.progress = Progress(config.steps, stream=self._stream)
         self._say = self.progress.note if progress else display.say
         self.means = Means()
         self._started = time.perf_counter()
@@ -132,24 +133,48 @@ class Report:
         self._last_row = now, env_steps
         self._return_sum, self._episodes = 0.0, 0
 
-    def eval_row(self, env_steps: int, updates: int, values: Mapping[str, Any]) -> None:
-        """An "eval" row."""
-        self._write("eval", env_steps, updates, self.seconds, values)
+    def bar(self, total: int, unit: str) -> Progress:
+        """A progress bar in place of the run's, whose last state stays, that counts so many of something."""
+        self.progress.close()
+        return Progress(total, unit, stream=self._stream)
+
+    def eval_row(self, env_steps: int, updates: int, values: Mapping[str, Any], kind: str = "eval") -> None:
+        """A row of an evaluation."""
+        self._write(kind, env_steps, updates, self.seconds, values)
 
     def evaluation(
-        self, env_steps: int, updates: int, played: Evaluation, seconds: float, values: Mapping[str, Any]
+        self,
+        kind: str,
+        env_steps: int,
+        updates: int,
+        played: Evaluation,
+        seconds: float,
+        values: Mapping[str, Any],
     ) -> float:
-        """An "eval" row of games and of other values of the same moment; the mean return."""
-        mean = float(np.mean(played.returns))
-        own = {
-            "eval/return_mean": mean,
-            "eval/returns": played.returns,
-            "eval/lengths": played.lengths,
-            "wall_eval_s": round(seconds, 3),
-        }
-        self.eval_row(env_steps, updates, own | dict(values))
-        games = f"{len(played.returns)} games, {seconds:.1f} s"
-        self.progress.note(f"evaluation after {env_steps} env steps: mean return {mean:.2f} over {games}")
+        """A row of games and of other values of the same moment; the mean return.
+
+        Args:
+            kind: "eval" or "final", with which the keys begin; a final one also has other statistics.
+            env_steps, updates: of that moment.
+            played: the games.
+            seconds: that they took.
+            values: others of the row.
+        """
+        returns, games = np.array(played.returns), len(played.returns)
+        mean = float(returns.mean())
+        own = {"return_mean": mean, "returns": played.returns, "lengths": played.lengths}
+        if kind == "final":
+            own |= {
+                "return_std": returns.std(ddof=1) if games > 1 else None,
+                "return_median": np.median(returns),
+                "length_mean": np.mean(played.lengths),
+                "games": games,
+            }
+        row = {f"{kind}/{name}": value for name, value in own.items()} | {f"wall_{kind}_s": round(seconds, 3)}
+        self.eval_row(env_steps, updates, row | dict(values), kind)
+        what = "final evaluation" if kind == "final" else "evaluation"
+        took = f"{games} games, {seconds:.1f} s"
+        self.progress.note(f"{what} after {env_steps} env steps: mean return {mean:.2f} over {took}")
         return mean
 
     def pictures(self, env_steps: int, drawn: Mapping[str, tuple[np.ndarray, ...]]) -> None:

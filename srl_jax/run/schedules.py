@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from srl_jax import annealing
 from srl_jax.config import Config
-from srl_jax.modes import MODES
+from srl_jax.learning import annealing
+from srl_jax.learning.modes import MODES
+from srl_jax.learning.update import Hyper
 from srl_jax.run.actor import linear
 from srl_jax.specs import Weight
 from srl_jax.types import Objective
-from srl_jax.update import Hyper
 
 
 class Now(NamedTuple):

@@ -1,56 +1,34 @@
 """What one seed of a run has on the host: environments, replay, rows, and the files that they go to."""
 
 import contextlib
-import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import numpy as np
 
-from srl_jax.agent import Agent
-from srl_jax.config import Config
+from srl_jax.config import Config, difference
 from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
-from srl_jax.latents import named_key
-from srl_jax.loading import greedy_policy
-from srl_jax.optim import real_copy
+from srl_jax.files.resuming import ENDS
+from srl_jax.learning.agent import Agent
 from srl_jax.replay import Replay, fitting
-from srl_jax.run.actor import FrameStack, Policy, make_env, random_policy, seed_for, yielding_threads
-from srl_jax.run.evaluate import Evaluation, evaluate
+from srl_jax.run import saving
+from srl_jax.run.actor import FrameStack, Policy, random_policy, seed_for
+from srl_jax.run.evaluations import FINAL, Evaluating, Evaluations
 from srl_jax.run.reporting import Report
 from srl_jax.run.schedules import Now
 from srl_jax.types import Params, TrainState
-
-RECORDED = 501
-"""Frames of the last evaluation that are kept: of 500 env steps."""
-
-
-class Evaluating(NamedTuple):
-    """An evaluation that is under way.
-
-    Attributes:
-        params: of the policy.
-        env_steps, updates: when these were the run's.
-        values: what the diagnostics of that moment say.
-    """
-
-    params: Params
-    env_steps: int
-    updates: int
-    values: dict[str, Any]
 
 
 class Seed:
     """One seed of a run; `parts` is all of it that changes while it runs, and so what a checkpoint holds.
 
     Attributes:
-        best: the largest mean return of an evaluation so far.
-        evaluating: the evaluation that is under way; its games are played in a thread.
+        evaluations: of its policy, whose games are played in a thread.
         saved: the newest checkpoint that can be resumed from; None before there is one.
 
     Args:
@@ -93,12 +71,7 @@ class Seed:
         if config.diagnostics:
             say = self.report.progress.note
             self.diagnostics = Diagnostics(config, agent.measures, agent.horizon, out, say)
-        self.recording: np.ndarray | None = None  # uint8 [T, H, W, C], the first games of the last evaluation
-        self.best = -np.inf
-        self.evaluating: Evaluating | None = None
-        self.games: Future[tuple[Evaluation, float]] | None = None  # of that evaluation, and seconds
-        self.eval_thread = yielding_threads("evaluation", 1)
-        self.eval_env: Any = None  # made when there is something to play
+        self.evaluations = Evaluations(config, agent, self.report, self._keep_best)
         self.saved: Manifest | None = None
         self.saved_position = self.replay.next_position.copy()  # replay's, when it was written
 
@@ -145,68 +118,21 @@ class Seed:
             if env_steps in self.diagnostics.steps:
                 self.keep(self.diagnostics.parts(state.params), env_steps, updates)
         if self.agent.mode.rl:
-            self.evaluating = Evaluating(self.agent.acting(state), env_steps, updates, values)
-            self.play()
+            self.evaluations.start(Evaluating(self.agent.acting(state), env_steps, updates, values))
         elif values:
             self.report.eval_row(env_steps, updates, values)
-
-    def play(self) -> None:
-        """Begins with the games of the evaluation under way, if there is one, in a thread of their own."""
-        if self.evaluating:
-            self.games = self.eval_thread.submit(self._played, self.evaluating)
-
-    def _played(self, evaluating: Evaluating) -> tuple[Any, float]:
-        """The games, and seconds."""
-        began, config = time.perf_counter(), self.config
-        if self.eval_env is None:
-            self.eval_env = make_env(config, "eval", min(config.num_envs, config.eval_games))
-        played = evaluate(
-            greedy_policy(self.agent, evaluating.params, named_key(self.key, "eval")),
-            self.eval_env,
-            games=config.eval_games,
-            seed=seed_for(config.seed, "eval", evaluating.env_steps),
-            epsilon=config.eps_eval,
-            stack=config.frame_stack,
-            max_steps=config.eval_max_steps,
-            record=RECORDED,
-            stop=lambda: self.evaluating is None,
-        )
-        return played, time.perf_counter() - began
-
-    def finish_evaluation(self, env_steps: int) -> float:
-        """Waits for the evaluation under way and writes its row; keeps the best parameters.
-
-        Args:
-            env_steps: of now, where the progress bar stands.
-
-        Returns:
-            Its mean return; -inf where none is under way.
-        """
-        if self.evaluating is None or self.games is None:
-            return -np.inf
-        played, seconds = self.games.result()
-        (params, then, updates, values), self.evaluating = self.evaluating, None
-        self.recording = played.frames
-        mean = self.report.evaluation(then, updates, played, seconds, values)
-        self.report.progress.update(env_steps, evaluation=mean)
-        if mean > self.best:
-            self.best = mean
-            if self.config.keep_best:
-                self.save_parameters(params, then, updates, folder="best", keep=1)
-        return mean
 
     def open(self, stack: contextlib.ExitStack) -> None:
         """Opens rows and threads in a context, which closes them and the environments."""
         stack.callback(self.close)
         stack.enter_context(self.report)
-        stack.enter_context(self.eval_thread)
-        stack.callback(setattr, self, "evaluating", None)  # nobody waits for its games any more
+        stack.enter_context(self.evaluations.thread)
+        stack.callback(self.evaluations.leave)
 
     def close(self) -> None:
         """Closes the environments."""
-        for env in (self.env, self.eval_env):
-            if env is not None:
-                env.close()
+        self.env.close()
+        self.evaluations.close()
 
     def parts(self, env_steps: int) -> dict[str, tuple[Callable, Callable]]:
         """{name: (snapshot, restore)} of all that changes on the host; `env_steps` is of now.
@@ -221,19 +147,14 @@ class Seed:
         }
 
     def _snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-        recording = {} if self.recording is None else {"recording": self.recording}
-        numbers = {
-            "best": self.best if np.isfinite(self.best) else None,
-            "evaluating": self.evaluating and self.evaluating[1:],
-            "rng": self.rng.bit_generator.state,
-        }
-        return {"stacks": self.stacks.frames, "score": self.score, **recording}, numbers
+        arrays, numbers = self.evaluations.snapshot()
+        own = {"stacks": self.stacks.frames, "score": self.score}
+        return own | arrays, numbers | {"rng": self.rng.bit_generator.state}
 
     def _restore(self, arrays: Mapping[str, np.ndarray], numbers: Mapping[str, Any]) -> None:
         self.stacks.frames[:] = fitting(arrays, "stacks", self.stacks.frames)
         self.score[:] = fitting(arrays, "score", self.score)
-        self.recording = arrays["recording"] if "recording" in arrays else None
-        self.best = -np.inf if numbers["best"] is None else float(numbers["best"])
+        self.evaluations.restore(arrays, numbers)
         self.rng.bit_generator.state = numbers["rng"]
 
     def save(self, state: TrainState, env_steps: int, updates: int) -> None:
@@ -252,14 +173,19 @@ class Seed:
             arrays |= {f"{part}_{name}": x for name, x in found.items()}
         unchanged = self.replay.unchanged_chunks(self.saved_position) if self.saved else ()
         names = frozenset(f"replay_{name}" for name in unchanged)
-        trees = {"learner": self._learner(state)}
-        if self.evaluating and self.evaluating.env_steps != env_steps:
-            trees["evaluating"] = self.evaluating.params
+        trees = {"learner": saving.rest(self.agent, state)}
+        under_way = self.evaluations.under_way
+        if under_way and under_way.env_steps != env_steps:
+            trees["evaluating"] = under_way.params
         return checkpoint.State(trees, arrays, numbers, names)
 
     def keep(self, params: Params, env_steps: int, updates: int) -> None:
         """Writes parameters into `encoders/`, where they stay."""
         self.save_parameters(params, env_steps, updates, folder="encoders", keep=0)
+
+    def _keep_best(self, params: Params, env_steps: int, updates: int) -> None:
+        if self.config.keep_best:
+            self.save_parameters(params, env_steps, updates, folder="best", keep=1)
 
     def save_parameters(self, params: Params, env_steps: int, updates: int, **options: Any) -> Manifest:
         """Writes a checkpoint, without options of parameters alone; see `srl_jax.files.checkpoint.save`."""
@@ -284,33 +210,17 @@ class Seed:
             ConfigError: the checkpoint is not of such a run, or the environments do not come back to what was
                 seen; names the file or says what differs.
         """
-        where, shapes = str(manifest.path), self.agent.shapes()
-        try:
-            params = checkpoint.load_into(shapes.params, checkpoint.load(manifest), where)
-            template = jax.eval_shape(self._learner, shapes)
-            learner = checkpoint.load_into(template, checkpoint.load_tree(manifest, "learner"), where)
+        with saving.resumable(manifest):
+            state = saving.restored(self.agent, manifest)
             numbers = checkpoint.load_numbers(manifest)
             for part, (_, restore) in self.parts(manifest.env_steps).items():
                 restore(checkpoint.Arrays(manifest, f"{part}_"), numbers[part])
             if evaluating := numbers["play"]["evaluating"]:
-                played = params
-                if evaluating[0] != manifest.env_steps:
-                    tree = checkpoint.load_tree(manifest, "evaluating")
-                    played = checkpoint.load_into(shapes.params, tree, where)
-                self.evaluating = Evaluating(real_copy(played), *evaluating)
-        except ConfigError:
-            raise
-        except (KeyError, TypeError, ValueError, IndexError, OverflowError, AttributeError) as error:
-            raise ConfigError(f"{where}: cannot be resumed from: {type(error).__name__}: {error}") from None
+                then = "params" if evaluating[0] == manifest.env_steps else "evaluating"
+                params = saving.params(self.agent, manifest, then)
+                under_way = Evaluating(params, *evaluating)
+                # One that was to be the last is not, where the run is extended.
+                if under_way.kind != FINAL or not difference(manifest.config, self.config, ENDS):
+                    self.evaluations.under_way = under_way
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
-        key = jax.random.wrap_key_data(learner.pop("key"))
-        return real_copy(shapes._replace(**{"params": params, "key": key, **learner}))
-
-    def _learner(self, state: TrainState) -> dict[str, Any]:
-        """What a checkpoint holds of the learner beside the parameters that act."""
-        learner = {name: getattr(state, name) for name in ("slow", "opt_state", "step")}
-        if self.agent.acting(state) is not state.params:
-            learner["params"] = state.params
-        if state.norms is not None:  # runs of before there were ratios have none
-            learner["norms"] = state.norms
-        return learner | {"key": jax.random.key_data(state.key)}
+        return state

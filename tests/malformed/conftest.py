@@ -24,7 +24,13 @@ CODE = "__import__('os').system('touch CANARY')"
 FITTING = tuple(f"--{name}={SMALL[name]}" for name in ("game", "frame_size", "encoder", "rl", "num_envs"))
 TRAIN = ("train", "--tune_runtime=off", "--out=run")
 START = (*TRAIN, *FITTING, "--mode=finetuned", "--encoder_from=source")
-GIVEN = (*TRAIN, *FITTING, "--mode=pretrain", "--objective=latent_l2", "--policy_from=source")
+GIVEN = (
+    *TRAIN,
+    *(flag for flag in FITTING if "--rl" not in flag),
+    "--mode=pretrain",
+    "--objective=latent_l2",
+    "--policy_from=source",
+)
 EVALUATE = ("evaluate", "--tune_runtime=off", "--run=source", "--games=1")
 DRAW = ("draw", "--run=source")
 OVERWRITE = (*TRAIN, "--game=Catch", "--overwrite")

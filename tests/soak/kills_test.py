@@ -41,18 +41,20 @@ KINDS = {
     "YarsRevenge": (),
     "YarsRevenge, sticky": ("--sticky_actions=0.25",),
     "Seaquest, sticky": ("--sticky_actions=0.25",),
-    "MsPacman, pretrain": ("--mode=pretrain",),
+    "MsPacman, pretrain": ("--mode=pretrain", "!rl", "!eval_games", "!eval_max_steps", "!slow_update_every"),
     "Catch, three seeds": ("--seeds=0,1,2",),
     "Pong, two seeds": ("--seeds=0,1",),
 }
-"""{name: flags}; the game is the name's first word."""
+"""{name: flags, and behind a ! those that are left out}; the game is the name's first word."""
 
 ENVIRONMENT = dict(os.environ, JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS="0", TF_CPP_MIN_LOG_LEVEL="3")
 
 
 def flags_of(kind):
     """Of a kind of run: its flags; where one is given twice, the last one counts."""
-    return last_of_each((*SMALL, f"--game={kind.split(',')[0]}", *KINDS[kind]))
+    given = last_of_each((*SMALL, f"--game={kind.split(',')[0]}", *KINDS[kind]))
+    left_out = {f"--{flag[1:]}" for flag in given if flag.startswith("!")}
+    return tuple(flag for flag in given if flag[0] != "!" and flag.partition("=")[0] not in left_out)
 
 
 def command(out, flags, at=""):

@@ -9,15 +9,14 @@ import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 
-from srl_jax import encoders, modes, objectives, rl, specs
+from srl_jax import encoders, objectives, rl, specs
 from srl_jax.augment import Views
 from srl_jax.config import Config
 from srl_jax.diagnostics.functions import Functions, make_functions
-from srl_jax.modes import Mode, encoder_learning_rate, second_learning_rate
-from srl_jax.optim import ENCODER, RL, make_optimizer
-from srl_jax.rl import Algorithm
-from srl_jax.types import Array, Context, Encoder, Objective, Params, TrainState, Window
-from srl_jax.update import (
+from srl_jax.learning import modes
+from srl_jax.learning.modes import Mode, encoder_learning_rate, second_learning_rate
+from srl_jax.learning.optim import ENCODER, RL, make_optimizer
+from srl_jax.learning.update import (
     Hyper,
     Pass,
     follow_every,
@@ -27,11 +26,13 @@ from srl_jax.update import (
     make_update,
     passes,
 )
-from srl_jax.weights import make_norms
+from srl_jax.learning.weights import make_norms
+from srl_jax.rl import Algorithm
+from srl_jax.types import Array, Context, Encoder, Objective, Params, TrainState, Window
 
 
 class Init(Protocol):
-    """The type of `Agent.init`: see `srl_jax.update.make_init`."""
+    """The type of `Agent.init`: see `srl_jax.learning.update.make_init`."""
 
     def __call__(self, key: jax.Array, given: Mapping[str, Params] | None = None, /) -> TrainState: ...
 
@@ -115,13 +116,13 @@ class Agent(NamedTuple):
         algorithm: the RL algorithm; in mode pretrain it acts (if it acts at all) but is not trained.
         objectives: the terms of the loss by name, RL's among them where the mode runs it.
         horizon: K of the windows it asks for.
-        init: see `srl_jax.update.make_init`.
-        update: `srl_jax.update.make_update`'s, without moving slow copies. Takes over the buffers of the
-            optimizer's state, and no others: the parameters may still act while it runs.
+        init: see `srl_jax.learning.update.make_init`.
+        update: `srl_jax.learning.update.make_update`'s, without moving slow copies. Takes over the buffers
+            of the optimizer's state, and no others: the parameters may still act while it runs.
         update_rl: the update that computes RL's loss alone, where `srl_every` asks for one; else None.
-        norms: `srl_jax.weights.make_norms`'s, to be called before every k-th update, k being
-            `srl_jax.update.NORM_EVERY`; None where no weight is a ratio.
-        follow: `srl_jax.update.make_follow`'s, to be called after every `follow_every` updates.
+        norms: `srl_jax.learning.weights.make_norms`'s, to be called before every k-th update, k being
+            `srl_jax.learning.update.NORM_EVERY`; None where no weight is a ratio.
+        follow: `srl_jax.learning.update.make_follow`'s, to be called after every `follow_every` updates.
         acting: TrainState -> the parameters that act: its own, or with the slow copies of RL's head and the
             encoder in their place, as the algorithm says.
         act: (params, frames, key, step, epsilon) -> actions, with noise; otherwise `make_act`'s.

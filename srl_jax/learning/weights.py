@@ -2,8 +2,8 @@
 
 `weight=ratio:0.1` (`srl_jax.specs.Weight`) holds the norm of an objective's gradient on the encoder at a
 tenth of the norm of RL's. Norms of single batches are noisy, so both are running means, of the norms in every
-k-th update, k being `srl_jax.update.NORM_EVERY`. They start at 0, and as much is always missing of one as of
-the other: their ratio has no bias to be corrected.
+k-th update, k being `srl_jax.learning.update.NORM_EVERY`. They start at 0, and as much is always missing of
+one as of the other: their ratio has no bias to be corrected.
 
 Adam does not see the scale of a loss. Where the objectives' gradients have an Adam of their own on the
 encoder, the ratios therefore rule its learning rate as well: the length of its step is held at the sum of the
@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import optax
 
 from srl_jax.augment import UNCHANGED, Views
-from srl_jax.latents import make_encoder_gradient
-from srl_jax.modes import Mode
-from srl_jax.optim import ENCODER, ENCODER_SRL, RL, Optimizer
+from srl_jax.learning.latents import make_encoder_gradient
+from srl_jax.learning.modes import Mode
+from srl_jax.learning.optim import ENCODER, ENCODER_SRL, RL, Optimizer
 from srl_jax.types import Array, Encoder, Objective, TrainState, Window
 
 DECAY = 0.9
@@ -59,10 +59,10 @@ def make_norms(
 ) -> Callable | None:
     """norms: (TrainState, Window, Hyper) -> `TrainState.norms`, pure; None where no weight is a ratio.
 
-    To be called before every k-th update, k being `srl_jax.update.NORM_EVERY`, from the first on, with its
-    window and its `Hyper`. It takes the gradient on the encoder of the mean loss of each ratio's objective,
-    and of RL's, at the parameters from before the update, and, of two Adams, the lengths of the steps that
-    they took last.
+    To be called before every k-th update, k being `srl_jax.learning.update.NORM_EVERY`, from the first on,
+    with its window and its `Hyper`. It takes the gradient on the encoder of the mean loss of each ratio's
+    objective, and of RL's, at the parameters from before the update, and, of two Adams, the lengths of the
+    steps that they took last.
     """
     names = ratios(objectives)
     if not names:

@@ -8,7 +8,7 @@ from srl_jax.specs import Spec, parse_change, value_text
 
 if TYPE_CHECKING:
     from srl_jax.config import Config
-    from srl_jax.modes import Mode
+    from srl_jax.learning.modes import Mode
 
 
 class Anneal(NamedTuple):
@@ -24,7 +24,7 @@ class Anneal(NamedTuple):
     updates: int
 
     def __str__(self) -> str:
-        """What `parse` reads."""
+        """What `parse` reads; of two texts that it reads as the same, the same."""
         return f"{value_text(self.start)}->{value_text(self.end)}@{self.updates}"
 
     def _between(self, start: float, end: float, updates: int) -> float:
@@ -65,39 +65,38 @@ def parse(text: str, kind: type) -> Anneal:
     return found
 
 
+def written(text: str, kind: type) -> str:
+    """The one way to write a text of `parse`: "10->3@10000" for "10->3@1e4"; "" stays.
+
+    Raises:
+        ConfigError: it is not such a text.
+    """
+    try:
+        return str(parse(text, kind)) if text else ""
+    except ValueError as error:
+        raise ConfigError(f"--{'n' if kind is int else 'gamma'}_anneal={text}: {error}") from None
+
+
 def check(config: "Config", mode: "Mode") -> None:
     """Raises ConfigError, a line that names the flag, where those of annealing and resets do not fit."""
     for name, kind in (("n_anneal", int), ("gamma_anneal", float)):
         if not (text := getattr(config, name)):
             continue
-        if not mode.rl:
-            raise ConfigError(f"--{name}={text}: --mode={mode.name} trains no RL")
-        try:
-            end = parse(text, kind).end
-        except ValueError as error:
-            raise ConfigError(f"--{name}={text}: {error}") from None
+        end = parse(written(text, kind), kind).end
         if kind is float and end != config.gamma:
             raise ConfigError(
                 f"--{name}={text}: ends at --gamma, which is {config.gamma}; give --gamma={end}"
             )
     if config.reset == "none":
-        for name in ("reset_every", "reset_last"):
-            if value := getattr(config, name):
-                raise ConfigError(f"--{name}={value}: --reset=none resets nothing; give --reset=head or all")
-    elif not config.reset_every:
+        return
+    if not config.reset_every:
         raise ConfigError(f"--reset={config.reset}: give --reset_every, the env steps between two resets")
-    elif 0 < config.reset_last < config.reset_every:
+    if 0 < config.reset_last < config.reset_every:
         every = f"--reset_every={config.reset_every}"
         raise ConfigError(f"--reset_last={config.reset_last}: is before the first reset, see {every}")
-    elif not mode.rl:
-        raise ConfigError(f"--reset={config.reset}: --mode={mode.name} trains no RL, whose heads are reset")
-    elif config.reset == "all" and not (mode.rl_trains_encoder or mode.representation_trains_encoder):
+    if config.reset == "all" and not (mode.rl_trains_encoder or mode.representation_trains_encoder):
         never = f"--mode={mode.name} never moves the encoder, which that shrinks"
         raise ConfigError(f"--reset=all: {never}; give --reset=head")
-    if config.reset != "all" and config.shrink != type(config).shrink:
-        raise ConfigError(
-            f"--shrink={config.shrink}: --reset={config.reset} shrinks nothing; --reset=all does"
-        )
 
 
 def check_n(text: str, rl: Spec) -> None:

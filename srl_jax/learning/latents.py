@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from srl_jax.augment import Seen, Views, make_seen
-from srl_jax.modes import Mode
-from srl_jax.optim import ENCODER, RL
+from srl_jax.learning.modes import Mode
+from srl_jax.learning.optim import ENCODER, RL
 from srl_jax.types import Array, Encoder, Latents, Objective, Offsets, Params, TrainState, Window
 
 

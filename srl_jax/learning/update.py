@@ -12,11 +12,11 @@ import numpy as np
 import optax
 from jax.typing import ArrayLike
 
-from srl_jax import weights
 from srl_jax.augment import UNCHANGED, Views
-from srl_jax.latents import make_losses, named_key
-from srl_jax.modes import ENCODER_OPTIMIZERS, GATES, Mode, both_train
-from srl_jax.optim import (
+from srl_jax.learning import weights
+from srl_jax.learning.latents import make_losses, named_key
+from srl_jax.learning.modes import ENCODER_OPTIMIZERS, GATES, Mode, both_train
+from srl_jax.learning.optim import (
     ENCODER,
     ENCODER_SRL,
     PROJECTIONS,
@@ -122,7 +122,7 @@ def passes(
     One, of the sum of all losses, unless both kinds of loss train the encoder.
 
     Args:
-        mode: a row of `srl_jax.modes`.
+        mode: a row of `srl_jax.learning.modes`.
         active: names of the objectives, RL's is "rl"; where one of them reads another group
             (`Objective.reads`), the objectives themselves by name. A pass that lets its objectives train the
             encoder moves what they read, too, in the second pass by a second Adam of that group's.
@@ -224,12 +224,13 @@ def make_update(
     Args:
         encoder: the shared encoder.
         objectives: by name; RL's is called "rl".
-        mode: a row of `srl_jax.modes`.
-        optimizer: from `srl_jax.optim`.
+        mode: a row of `srl_jax.learning.modes`.
+        optimizer: from `srl_jax.learning.optim`.
         plan: the passes, see `passes`; None for those of all objectives. The heads of others do not move.
-        gate: a key of `srl_jax.modes.GATES`: how the gradients of RL and of the objectives meet in the
-            encoder where the plan has both. "pcgrad" and "orthogonal", see `srl_jax.optim.PROJECTIONS`, take
-            both at the same parameters; heads do not notice. What stops at the latent is the mode's to say.
+        gate: a key of `srl_jax.learning.modes.GATES`: how the gradients of RL and of the objectives meet in
+            the encoder where the plan has both. "pcgrad" and "orthogonal", see
+            `srl_jax.learning.optim.PROJECTIONS`, take both at the same parameters; heads do not notice. What
+            stops at the latent is the mode's to say.
         views: what each loss sees.
         slow_follows: whether the slow copies move by their rules; False leaves that to `make_follow`, which
             then must be called after every `follow_every` updates: an update that never writes to the slow
@@ -240,7 +241,7 @@ def make_update(
         importance weights), `loss/total`, `NAME/...` of each objective's own; `grad_norm/encoder` (where it
         moves) and `grad_norm/all` (where gradients are clipped; before that), with `_srl` behind them in the
         second of two passes, and `step_ratio/encoder`, the length of the second pass' step of the encoder
-        over the first's. Those of the encoder are `srl_jax.optim.NOT_MEASURED` but in every k-th
+        over the first's. Those of the encoder are `srl_jax.learning.optim.NOT_MEASURED` but in every k-th
         update, k being `NORM_EVERY`.
     """
     if gate not in GATES:

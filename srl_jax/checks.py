@@ -1,0 +1,276 @@
+"""What of a configuration is read, and what fits together. Imports no jax."""
+
+from collections.abc import Callable, Collection
+from typing import TYPE_CHECKING, Any
+
+from srl_jax.errors import ConfigError
+from srl_jax.learning import annealing
+from srl_jax.learning.modes import MODES, PROJECTING, Mode, both_train, of, ratios, two_optimizers
+from srl_jax.needs import EVERYTHING, UNKNOWN, Run
+
+if TYPE_CHECKING:
+    from srl_jax.config import Config
+
+
+def _such(holds: Callable[[Mode], Any]) -> str:
+    return f"modes that do: {', '.join(mode.name for mode in MODES.values() if holds(mode))}"
+
+
+def _trains_rl(run: Run) -> str:
+    mode = MODES[run.config.mode]
+    return "" if mode.rl else f"in --mode={mode.name}, which trains no RL"
+
+
+def _acts_at_random(run: Run) -> str:
+    mode = MODES[run.config.mode]
+    return f"in --mode={mode.name}, which acts with the policy that it learns" if mode.rl else ""
+
+
+def _trains_objectives(run: Run) -> str:
+    mode = MODES[run.config.mode]
+    do = _such(lambda mode: mode.representation)
+    return "" if mode.representation else f"in --mode={mode.name}, which runs no representation loss ({do})"
+
+
+def _moves_encoder(run: Run) -> str:
+    mode = MODES[run.config.mode]
+    moves = mode.rl_trains_encoder or mode.representation_trains_encoder
+    return "" if moves else f"in --mode={mode.name}, which never moves the encoder"
+
+
+def _could_share(run: Run) -> str:
+    mode = MODES[run.config.mode]
+    never = f"in --mode={mode.name}, where RL and representation do not both train the encoder"
+    return "" if both_train(mode) else f"{never} ({_such(both_train)})"
+
+
+def _shares(run: Run) -> str:
+    if why := _could_share(run):
+        return why
+    gate = f"with --gate={run.config.gate}, where RL and representation do not both train the encoder"
+    return "" if both_train(of(run.config)) else gate
+
+
+def _second_rate(run: Run) -> str:
+    if why := _shares(run):
+        return why
+    if not two_optimizers(run.config):
+        return "with --encoder_optimizer=summed, where the encoder has one optimizer, of --lr_encoder"
+    found = ratios(run.config)
+    return f"where {found[0]} says how long the second Adam's step is" if found else ""
+
+
+def _rate_of_objectives(run: Run) -> str:
+    # Beside the heads', it is the encoder's where the representation has an Adam of it, and no rate is given.
+    config, mode = run.config, of(run.config)
+    second = two_optimizers(config) and not ratios(config) and not config.lr_encoder_srl
+    first = mode.representation_trains_encoder and not mode.rl_trains_encoder and not config.lr_encoder
+    heads = run.heads is None or run.heads
+    return "" if heads or first or second else "where no objective has a head, nor the encoder its rate"
+
+
+def _has_decoder(run: Run) -> str:
+    terms = run.terms
+    none = terms is not None and not any(term.is_decoder for term in terms.values())
+    return "where no objective has a decoder" if none else ""
+
+
+def _has_slow_copy(run: Run) -> str:
+    mode = MODES[run.config.mode]
+    if mode.rl and run.look("rl:slow") != "none" or mode.representation and _slow(run, own_views=True):
+        return ""
+    return "where nothing has a slow copy"
+
+
+def _slow(run: Run, own_views: bool) -> bool:
+    """Whether an objective has slow copies, one with views of its own counting or not; True if not known."""
+    if run.terms is None:
+        return True
+    names = [spec.name for spec in run.objectives or () if own_views or "view" not in spec.resolved]
+    return any(run.terms[name].slow for name in names)
+
+
+def _rl_looks(run: Run) -> bool:
+    """Whether RL sees what the run's views make of a window, and not views of its own; True if not known."""
+    return MODES[run.config.mode].rl and run.look("rl:view") in ("none", UNKNOWN)
+
+
+def _has_target(run: Run) -> str:
+    mode = MODES[run.config.mode]
+    if _rl_looks(run) or mode.representation and _slow(run, own_views=False):
+        return ""
+    return "without RL or an objective that has a slow copy and no views of its own"
+
+
+def _each_of_rl(run: Run) -> str:
+    if not run.config.rl_view.endswith("@each") or _rl_looks(run):
+        return ""
+    return f"with --rl=:view={run.look('rl:view')}, which draws views of a sequence as replay has it"
+
+
+def _each_of_objectives(run: Run) -> str:
+    known = run.objectives
+    if not run.config.srl_view.endswith("@each") or known is None:
+        return ""
+    looks = any("view" not in spec.resolved for spec in known)
+    return "" if looks else "where all objectives draw views of a sequence as replay has it"
+
+
+def _augments(run: Run) -> str:
+    config, mode = run.config, MODES[run.config.mode]
+    if config.augment == "srl" and (why := _trains_objectives(run)):
+        return why
+    rl = config.augment == "all" and mode.rl and not config.rl_view
+    given = " and ".join(f"--{name}" for name in ("rl_view", "srl_view") if getattr(config, name))
+    return "" if rl or mode.representation and not config.srl_view else f"beside {given}"
+
+
+def _heads(run: Run) -> str:
+    return {"all": _trains_rl, "none": _trains_objectives}.get(run.config.heads_from, lambda run: "")(run)
+
+
+def _changes(first: str, last: str) -> Callable[[Run], str]:
+    def changes(run: Run) -> str:
+        start, end = run.look(first), run.look(last)
+        return f"where --{first} and --{last} are both {start}" if start == end else ""
+
+    return changes
+
+
+FACTS: dict[str, Callable[[Run], str]] = {
+    "RL is trained": _trains_rl,
+    "RL is not trained": _acts_at_random,
+    "objectives are trained": _trains_objectives,
+    "the encoder moves": _moves_encoder,
+    "the encoder may be shared": _could_share,
+    "the encoder is shared": _shares,
+    "the second rate": _second_rate,
+    "the objectives' rate": _rate_of_objectives,
+    "a decoder": _has_decoder,
+    "a slow copy": _has_slow_copy,
+    "a target": _has_target,
+    "each of RL": _each_of_rl,
+    "each of objectives": _each_of_objectives,
+    "augments": _augments,
+    "heads": _heads,
+    "beta changes": _changes("beta", "beta_final"),
+    "epsilon changes": _changes("eps_train", "eps_final"),
+}
+"""{what a need may name: (Run) -> why it does not hold, to follow "nothing reads it", or ""}."""
+
+_RL, _OBJECTIVES = "RL is trained", "objectives are trained"
+_PRIORITIES = f"{_RL},rl:prioritized=true,rl:alpha!=0"
+
+NEEDS = {
+    **dict.fromkeys(
+        ("rl", "gamma", "gamma_anneal", "n_anneal", "reset", "lr_rl", "eps_train", "eps_final", "eps_eval",
+         "eval_games", "eval_envs", "eval_max_steps", "final_games", "stop_at_return", "keep_best"), _RL,
+    ),
+    "augment": "augments",
+    "rl_view": f"{_RL},each of RL",
+    "srl_view": f"{_OBJECTIVES},each of objectives",
+    "target_view": "a target",
+    "srl_every": f"{_OBJECTIVES},{_RL}",
+    "gate": "the encoder may be shared",
+    "encoder_optimizer": "the encoder is shared",
+    "target_encoder": "a slow copy",
+    "reset_every": "reset!=none",
+    "reset_last": "reset!=none",
+    "shrink": "reset=all",
+    "lr_srl": f"{_OBJECTIVES},the objectives' rate",
+    "lr_encoder": "the encoder moves",
+    "lr_encoder_srl": "the encoder moves,the second rate",
+    "decoder_weight_decay": f"{_OBJECTIVES},a decoder",
+    "beta": _PRIORITIES,
+    "beta_final": _PRIORITIES,
+    "beta_anneal_steps": f"{_PRIORITIES},beta changes",
+    "eps_anneal_steps": f"{_RL},epsilon changes",
+    "slow_update_every": f"{_RL},rl:slow=periodic",
+    "diagnostics_kept": "diagnostics=true",
+    "heads_from": "encoder_from!=,heads",
+    "policy_from": "RL is not trained",
+    "pretrain_epsilon": "policy_from!=",
+}  # fmt: skip
+"""{field of Config that is not always read: what it needs}, see `srl_jax.needs`."""
+
+
+def run_of(config: "Config", **known: Any) -> Run:
+    """What is known of a run; `known` as of `srl_jax.needs.Run`."""
+    return Run(config, NEEDS, FACTS, **known)
+
+
+def check(
+    config: "Config",
+    *,
+    given: Collection[str] = EVERYTHING,
+    needs_encoder: bool = False,
+    hint: str = "",
+    complete: bool = True,
+) -> "Config":
+    """Whether the settings fit the mode, as far as can be said without the registries.
+
+    Args:
+        config: the run.
+        given: the fields that were given, of which each has to be read.
+        needs_encoder: the run must start from an encoder even where its mode may start from
+            scratch.
+        hint: how to make such an encoder; ends the error.
+        complete: False asks for no encoder: the settings are only to be looked at.
+
+    Returns:
+        The config, with defaults for what nothing reads.
+
+    Raises:
+        ConfigError: they do not; one line that names the flag.
+    """
+    mode = MODES[config.mode]
+    needs_encoder = needs_encoder or mode.encoder_start == "checkpoint"
+    if complete and needs_encoder and not config.encoder_from:
+        hint = hint or "any run has an encoder, and --mode=pretrain trains nothing else"
+        raise ConfigError(f"--encoder_from: --mode={mode.name} needs --encoder_from=PATH; {hint}")
+    if config.encoder_from and mode.encoder_start == "scratch":
+        others = ", ".join(m.name for m in MODES.values() if m.encoder_start != "scratch")
+        raise ConfigError(
+            f"--encoder_from={config.encoder_from}: --mode={mode.name} starts from scratch; "
+            f"modes that start from an encoder: {others}"
+        )
+    if config.objectives and not mode.representation:
+        others = ", ".join(m.name for m in MODES.values() if m.representation)
+        raise ConfigError(
+            f"--objective: --mode={mode.name} runs no representation loss (--objective=none drops "
+            f"a preset's); modes that do: {others}"
+        )
+    if mode.representation and not config.objectives:
+        raise ConfigError(
+            f"--objective: --mode={mode.name} needs at least one, for example "
+            "--objective=reconstruction:weight=1"
+        )
+    run_of(config).refuse(given)
+    config = run_of(config).in_force()
+    annealing.check(config, mode)
+    if config.gate in PROJECTING and config.encoder_optimizer == "separate":
+        raise ConfigError(
+            f"--gate={config.gate}: with --encoder_optimizer=separate the second gradient is taken after "
+            "RL's step, so that the two do not meet; give --encoder_optimizer=summed or simultaneous"
+        )
+    _check_ratios(config)
+    return config
+
+
+def _check_ratios(config: "Config") -> None:
+    if not (found := ratios(config)):
+        return
+    flag = f"--objective={found[0]}"
+    if not both_train(of(config)):
+        raise ConfigError(
+            f"{flag}: a ratio is to RL's gradient on the encoder, and with --mode={config.mode} and "
+            f"--gate={config.gate} RL and representation do not both train it; give a number"
+        )
+    if not two_optimizers(config):
+        return
+    if len(found) < len(config.objectives):
+        raise ConfigError(
+            f"{flag}: with --encoder_optimizer={config.encoder_optimizer} a ratio is of the length of the "
+            "second Adam's step, which all objectives share; give all of them ratios, or "
+            "--encoder_optimizer=summed"
+        )

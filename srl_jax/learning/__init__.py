@@ -1,0 +1,1 @@
+"""What one update does: from a configuration to jitted functions; imports of it go to its modules."""
