@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 
-from srl_jax import Replay, encoders, envs, losses, objectives, types, window
-from srl_jax.learning import latents
+from srl_jax import Replay, encoders, envs, latents, losses, objectives, types, window
 
 N, A, ATOMS = 8, 3, jnp.linspace(-2, 2, 31)
 conv, flat = nn.Conv(16, (6, 6), 4), lambda x: x.reshape(len(x), -1)

@@ -1,11 +1,11 @@
-"""Tests of experiments.claims."""
+"""Tests of experiments.analyses.claims."""
 
 import json
 
 import numpy as np
 import pytest
 
-from experiments import claims
+from experiments.analyses import claims
 from experiments.runs import populations
 from srl_jax import data, statistics
 

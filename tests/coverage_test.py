@@ -1,12 +1,13 @@
-"""Tests of experiments.coverage: why differences of few seeds have t intervals."""
+"""Tests of experiments.analyses.coverage: why differences of few seeds have t intervals."""
 
+import itertools
 import json
 
 import numpy as np
 import pytest
 from absl import flags
 
-from experiments import coverage
+from experiments.analyses import coverage
 from experiments.runs import populations
 from srl_jax import statistics
 
@@ -70,9 +71,19 @@ def test_means_of_runs_drawn_again_are_those_of_the_draws(monkeypatch):
     assert {round(float(p), 6) for p in points[0]} == {2, 2.5, 4, 4.5}  # the two in the middle of four
 
 
+def test_a_difference_is_of_two_arms_of_one_game():
+    """Arms whose values are 1 from their mean on a game of one arm, and 10, 20 and 30 on another."""
+    given = [[np.array([4.0, 6.0])], [n * np.array([-1.0, 1.0]) + 3 for n in (10, 20, 30)]]
+    x, y = coverage.drawn(np.random.default_rng(0), given, 500, 3)
+    sizes = np.abs(np.stack([x, y], -1)[..., 0, :])
+    assert (sizes == sizes[:, :1]).all()  # all runs of an arm are of one population
+    pairs = {(int(a), int(b)) for a, b in sizes[:, 0]}
+    assert pairs == {(1, 1), *itertools.permutations((10, 20, 30), 2)}
+
+
 def test_the_table_has_a_column_for_each_number_of_runs(monkeypatch):
     monkeypatch.setattr(coverage, "RUNS", (2, 3))
-    given = [coverage.Returns("a", [populations.normal()]), coverage.Returns("b", (), [np.arange(9.0)] * 2)]
+    given = [coverage.Returns("a", [[populations.normal()]]), coverage.Returns("b", (), [np.arange(9.0)] * 2)]
     found = coverage.table(40, given)
     assert found == coverage.table(40, given)
     head, *rows = coverage.lines(found)
@@ -88,7 +99,7 @@ def test_it_writes_what_it_prints(monkeypatch, tmp_path, capsys):
     values(["coverage", "--experiments=5", f"--out={tmp_path / 'new'}"])
     monkeypatch.setattr(coverage, "FLAGS", values)
     monkeypatch.setattr(coverage, "RUNS", (3,))
-    monkeypatch.setattr(coverage, "sources", lambda: [coverage.Returns("a", [np.arange(9.0)])])
+    monkeypatch.setattr(coverage, "sources", lambda: [coverage.Returns("a", [[np.arange(9.0)]])])
     coverage.main([])
     written = json.loads((tmp_path / "new/coverage.json").read_text())
     assert coverage.lines(written["covered"]) == capsys.readouterr().out.splitlines()

@@ -10,7 +10,7 @@ from srl_jax.augment import UNCHANGED
 from srl_jax.encoders.convolutional import RADIUS, Layer, convolutional_encoder
 from srl_jax.encoders.lix import MOST, Mixing, discontinuity, mixed, moved, tuned
 from srl_jax.encoders.options import End, Start
-from srl_jax.learning.latents import make_losses
+from srl_jax.latents import make_losses
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import make_optimizer
 from srl_jax.learning.update import make_init, passes

@@ -1,4 +1,4 @@
-"""srl_jax/learning/latents.py: what each loss sees of a window, by which parameters; how often it encodes."""
+"""srl_jax/latents.py: what each loss sees of a window, by which parameters; how often it encodes."""
 
 import re
 
@@ -11,7 +11,7 @@ from srl_jax import augment
 from srl_jax.augment import Views, make_view, random_shift
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.learning.latents import make_latents
+from srl_jax.latents import make_latents
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, make_optimizer
 from srl_jax.learning.update import (

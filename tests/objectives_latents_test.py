@@ -10,7 +10,7 @@ import pytest
 
 from srl_jax import objectives
 from srl_jax.augment import make_view
-from srl_jax.learning.latents import make_latents
+from srl_jax.latents import make_latents
 from srl_jax.objectives.bisimulation import bisimulation_error
 from srl_jax.objectives.infonce import info_nce
 from srl_jax.objectives.latent_l2 import l2_norm

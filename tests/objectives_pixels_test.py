@@ -6,7 +6,7 @@ import pytest
 
 from srl_jax import encoders, objectives
 from srl_jax.envs import make
-from srl_jax.learning.latents import make_latents
+from srl_jax.latents import make_latents
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import make_optimizer
 from srl_jax.learning.update import Hyper, make_init, make_update

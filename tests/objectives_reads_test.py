@@ -11,9 +11,9 @@ from srl_jax.config import Config
 from srl_jax.diagnostics.functions import make_functions
 from srl_jax.encoders.convolutional import Layer, convolutional_encoder
 from srl_jax.encoders.options import End, Start
+from srl_jax.latents import make_losses
 from srl_jax.layers import Conv, ConvTranspose
 from srl_jax.learning.agent import components
-from srl_jax.learning.latents import make_losses
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, RL_SRL, make_optimizer
 from srl_jax.learning.resets import reset

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from srl_jax import objectives, rl, specs
-from srl_jax.learning.latents import make_latents, shut
+from srl_jax.latents import make_latents, shut
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, make_optimizer
 from srl_jax.learning.update import Hyper, make_init, make_update, periodic

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from srl_jax.config import Config
+from srl_jax.latents import make_latents
 from srl_jax.learning.agent import make_agent
-from srl_jax.learning.latents import make_latents
 from srl_jax.learning.optim import ENCODER, RL
 from srl_jax.learning.resets import reset
 from srl_jax.rl import REGISTRY, Algorithm

@@ -47,7 +47,7 @@ def test_every_package_is_installed_but_what_only_a_checkout_needs():
         for folder, name in folders.items()
         for path in (ROOT / folder).rglob("__init__.py")
     ]
-    checkout_only = {"srl_jax.experiments.benchmarks"}
+    checkout_only = {f"srl_jax.experiments.{name}" for name in ("analyses", "benchmarks")}
     assert sorted(named) == sorted(set(found) - checkout_only)
 
 

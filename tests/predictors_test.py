@@ -1,4 +1,4 @@
-"""Tests of experiments.predictors."""
+"""Tests of experiments.analyses.predictors."""
 
 import json
 
@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from experiments import predictors
-from experiments.predictors import Stratum
+from experiments.analyses import predictors
+from experiments.analyses.predictors import Stratum
 from experiments.runs.populations import ChosenArm
 from experiments.runs.run_data import load_run
 from tests.helpers import write_run

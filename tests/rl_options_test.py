@@ -9,8 +9,8 @@ import pytest
 import rlax
 
 from srl_jax import rl
+from srl_jax.latents import named_key
 from srl_jax.learning.agent import slow_params
-from srl_jax.learning.latents import named_key
 from srl_jax.learning.optim import RL
 from srl_jax.learning.update import periodic
 from srl_jax.rl import values

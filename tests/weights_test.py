@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from functools import partial
-from types import SimpleNamespace
 from unittest import mock
 
 import jax
@@ -21,7 +20,7 @@ from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, make_optimizer
 from srl_jax.learning.update import NORM_EVERY, Hyper, make_init, make_update, passes
 from srl_jax.learning.weights import DECAY, make_norms
-from srl_jax.run import loop, seed
+from srl_jax.run import loop, saving
 from srl_jax.run.schedules import Schedules
 from srl_jax.specs import Weight, parse_weight
 from srl_jax.types import Objective
@@ -213,7 +212,7 @@ def test_a_run_with_ratios_resumes_bit_identically(alone, tmp_path):
 def test_a_checkpoint_without_ratios_is_what_it_was_before_there_were_any():
     def kept(config: Config) -> set[str]:
         agent = make_agent(config, (42, 42, 1), 3)
-        return set(jax.eval_shape(partial(seed.Seed._learner, SimpleNamespace(agent=agent)), agent.shapes()))
+        return set(jax.eval_shape(partial(saving.rest, agent), agent.shapes()))
 
     plain = kept(Config(**SMALL))
     assert plain == {"slow", "opt_state", "step", "key"} and kept(RUN) == {*plain, "norms"}

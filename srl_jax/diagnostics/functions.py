@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import optax
 
 from srl_jax.augment import UNCHANGED, Views
+from srl_jax.latents import make_encoder_gradient
 from srl_jax.learning import weights
-from srl_jax.learning.latents import make_encoder_gradient
 from srl_jax.learning.modes import Mode
 from srl_jax.learning.optim import ENCODER, RL
 from srl_jax.learning.update import Hyper

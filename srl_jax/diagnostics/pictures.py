@@ -5,8 +5,8 @@ from typing import Any
 import jax
 import numpy as np
 
+from srl_jax.latents import make_latents
 from srl_jax.learning.agent import Agent
-from srl_jax.learning.latents import make_latents
 from srl_jax.replay import Replay
 
 PICTURES = 6

@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from srl_jax.learning.latents import named_key
+from srl_jax.latents import named_key
 from srl_jax.learning.optim import ENCODER, ENCODER_SRL, RL, RL_SRL
 from srl_jax.types import Array, Params, TrainState
 

@@ -13,8 +13,8 @@ import optax
 from jax.typing import ArrayLike
 
 from srl_jax.augment import UNCHANGED, Views
+from srl_jax.latents import make_losses, named_key
 from srl_jax.learning import weights
-from srl_jax.learning.latents import make_losses, named_key
 from srl_jax.learning.modes import ENCODER_OPTIMIZERS, GATES, Mode, both_train
 from srl_jax.learning.optim import (
     ENCODER,

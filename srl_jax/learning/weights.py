@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import optax
 
 from srl_jax.augment import UNCHANGED, Views
-from srl_jax.learning.latents import make_encoder_gradient
+from srl_jax.latents import make_encoder_gradient
 from srl_jax.learning.modes import Mode
 from srl_jax.learning.optim import ENCODER, ENCODER_SRL, RL, Optimizer
 from srl_jax.types import Array, Encoder, Objective, TrainState, Window

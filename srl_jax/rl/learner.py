@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
-from srl_jax.learning.latents import named_key
+from srl_jax.latents import named_key
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.losses import midpoints, munchausen_return, soft_policy
 from srl_jax.rl.values import Values

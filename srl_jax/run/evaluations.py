@@ -10,8 +10,8 @@ import jax
 import numpy as np
 
 from srl_jax.config import Config
+from srl_jax.latents import named_key
 from srl_jax.learning.agent import Agent
-from srl_jax.learning.latents import named_key
 from srl_jax.loading import greedy_policy
 from srl_jax.run.actor import make_env, seed_for, yielding_threads
 from srl_jax.run.evaluate import Evaluation, evaluate, telling

@@ -12,9 +12,9 @@ intervals of the stratified bootstrap, which draws runs again within each game, 
 for what is no mean. An `Interval` says which it is. A single run has none: its limits are NaN.
 
 With few runs the bootstrap is too narrow. Of intervals at 95 %, this share contains the truth, in percent
-(`python -m experiments.coverage`: up to 10,000 simulated experiments each; Atari: distributions like those of
-DER's 100 published runs; Catch: residuals of 185 runs; "two kinds": runs of which 30 % learn the game and the
-others do not; experiments/results/coverage has the table):
+(`python -m experiments.analyses.coverage`: up to 10,000 simulated experiments each; Atari: distributions like
+those of DER's 100 published runs; Catch: residuals of 185 runs; "two kinds": runs of which 30 % learn the
+game and the others do not; experiments/results/coverage has the table):
 
     runs of each game                               2    3    5    7   10   20
     Catch, mean, bootstrap                         49   74   84   87   89   92

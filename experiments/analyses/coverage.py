@@ -1,4 +1,4 @@
-"""How often 95 % intervals of few runs contain the truth: `python -m experiments.coverage`.
+"""How often 95 % intervals of few runs contain the truth: `python -m experiments.analyses.coverage`.
 
 Simulates experiments whose truth is known, on returns from formulas, from the runs in results/catch_runs.json
 and from published spreads, and prints which share of each kind of interval contains the truth, in percent.
@@ -17,10 +17,10 @@ from srl_jax import data, statistics
 from srl_jax.files import display
 from srl_jax.specs import Info
 
-from .command_line import flags as config_flags
-from .command_line import paths
-from .reporting import texts
-from .runs import populations
+from ..command_line import flags as config_flags
+from ..command_line import paths
+from ..reporting import texts
+from ..runs import populations
 
 FLAGS = flags.FLAGS
 RUNS = (2, 3, 5, 7, 10, 20)
@@ -34,7 +34,7 @@ SEVERAL = 10
 TAILS = (0.025, 0.975)
 _BLOCK = 1 << 21
 """Scores that are drawn again at once."""
-DER = "DER, 100 runs"
+DER, SPR = "DER, 100 runs", "SPR, 100 runs"
 
 
 class Returns(NamedTuple):
@@ -42,12 +42,13 @@ class Returns(NamedTuple):
 
     Attributes:
         name: in the table.
-        arms: populations, see `runs.populations`: an arm on one game is of one of them.
+        arms: for each game, the populations of its arms, see `runs.populations`: a difference is of two
+            different ones of a game, or of the same one twice where the game has no other.
         games: the populations of several games; none has no aggregate.
     """
 
     name: str
-    arms: Sequence[np.ndarray] = ()
+    arms: Sequence[Sequence[np.ndarray]] = ()
     games: Sequence[np.ndarray] = ()
 
 
@@ -55,23 +56,27 @@ def sources() -> list[Returns]:
     """All that the table is of."""
     normal, two = populations.normal(), populations.two_kinds()
     arms = populations.chosen()
-    pools = [
-        populations.residuals([populations.areas(arm) for arm in arms if arm.game == game])
-        for game in ("Catch", "CatchDistractor")
-    ]
-    tens = [populations.areas(arm) for arm in arms if len(arm.runs) == 10]
-    der = [
-        statistics.human_normalised(game, populations.like(score))
-        for game, score in data.atari100k(DER).items()
-    ]
+    pools, tens = [], []
+    for game in ("Catch", "CatchDistractor"):
+        areas = [populations.areas(arm) for arm in arms if arm.game == game]
+        pools.append(populations.residuals(areas))
+        tens.append([area for area in areas if len(area) == 10])
+    der, spr = (
+        [
+            statistics.human_normalised(game, populations.like(score))
+            for game, score in data.atari100k(method).items()
+        ]
+        for method in (DER, SPR)
+    )
     return [
-        Returns("normal", [normal], [normal] * GAMES),
-        Returns("two kinds", [two], [two] * GAMES),
-        Returns("Catch", [pools[0]]),
-        Returns("CatchDistractor", [pools[1]]),
+        Returns("normal", [[normal]], [normal] * GAMES),
+        Returns("two kinds", [[two]], [two] * GAMES),
+        Returns("Catch", [[pools[0]]]),
+        Returns("CatchDistractor", [[pools[1]]]),
         Returns("Catch and CatchDistractor", (), pools),
         Returns("arms of ten", tens),
-        Returns("Atari 100k, DER", der, der),
+        Returns("Atari 100k, DER", [[game] for game in der], der),
+        Returns("Atari 100k, DER and SPR", list(zip(der, spr, strict=True))),
     ]
 
 
@@ -188,11 +193,28 @@ def _less(arms: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np
     return point - sum(others), np.concatenate([variances for _, variances in arms], axis=-1)
 
 
-def drawn(rng: np.random.Generator, given: Sequence[np.ndarray], experiments: int, runs: int) -> np.ndarray:
-    """Scores of one game, [experiments, runs, 1], each of them of one of the populations, less its mean."""
-    of = rng.integers(len(given), size=experiments)
-    rows = [rng.choice(given[which] - given[which].mean(), runs) for which in of]
-    return np.array(rows)[..., None]
+def drawn(
+    rng: np.random.Generator, given: Sequence[Sequence[np.ndarray]], experiments: int, runs: int
+) -> list[np.ndarray]:
+    """Scores of two arms on one game, [experiments, runs, 1] each, less the means of their populations.
+
+    Args:
+        rng: of the games, the arms and their runs.
+        given: see `Returns.arms`; each experiment is on one of the games.
+        experiments: how many.
+        runs: of each arm.
+    """
+    games = rng.integers(len(given), size=experiments)
+    sizes = np.array([len(given[game]) for game in games])
+    first = rng.integers(sizes)
+    second = (first + rng.integers(1, np.maximum(sizes, 2))) % sizes
+    centred = [[arm - arm.mean() for arm in arms] for arms in given]
+    return [
+        np.array([rng.choice(centred[game][arm], runs) for game, arm in zip(games, arms, strict=True)])[
+            ..., None
+        ]
+        for arms in (first, second)
+    ]
 
 
 def table(
@@ -212,7 +234,7 @@ def table(
             rng = np.random.default_rng([seed, zlib.crc32(source.name.encode()), runs])
             shares = {}
             if source.arms:
-                arms = [drawn(rng, source.arms, experiments, runs) for _ in range(2)]
+                arms = drawn(rng, source.arms, experiments, runs)
                 shares["mean"] = covered(rng, arms[:1], mean, 0.0)
                 shares["difference"] = covered(rng, arms, mean, 0.0)
             if source.games:

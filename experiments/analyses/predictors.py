@@ -1,4 +1,4 @@
-"""Which diagnostic predicts the return: `python -m experiments.predictors`.
+"""Which diagnostic predicts the return: `python -m experiments.analyses.predictors`.
 
 Rank correlations of what a run says of its latent early in training, `diag/...`, with the area under its
 learning curve from then on, over the runs of results/catch_runs.json: within arms and across them. `--out`
@@ -17,13 +17,13 @@ from srl_jax.errors import ConfigError
 from srl_jax.files import display
 from srl_jax.statistics import ENOUGH
 
-from .command_line import flags as config_flags
-from .command_line import paths
-from .drawing import plots
-from .reporting import texts
-from .runs import populations
-from .runs.populations import ChosenArm
-from .runs.run_data import RunData
+from ..command_line import flags as config_flags
+from ..command_line import paths
+from ..drawing import plots
+from ..reporting import texts
+from ..runs import populations
+from ..runs.populations import ChosenArm
+from ..runs.run_data import RunData
 
 FLAGS = flags.FLAGS
 MOMENTS = (9_000, 18_000)

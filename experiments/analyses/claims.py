@@ -1,4 +1,4 @@
-"""What a claim of few seeds is worth: `python -m experiments.claims`.
+"""What a claim of few seeds is worth: `python -m experiments.analyses.claims`.
 
 Splits the runs of results/catch_runs.json into the few seeds that a paper would have had and others that look
 again, and draws runs of published spreads: how often a rule claims that two arms differ where nothing does,
@@ -19,12 +19,12 @@ from srl_jax import data, statistics
 from srl_jax.errors import ConfigError
 from srl_jax.files import display
 
+from ..command_line import flags as config_flags
+from ..command_line import paths
+from ..drawing import plots
+from ..reporting import texts
+from ..runs import populations
 from . import coverage
-from .command_line import flags as config_flags
-from .command_line import paths
-from .drawing import plots
-from .reporting import texts
-from .runs import populations
 
 FLAGS = flags.FLAGS
 SEEDS = (3, 5)

@@ -1,0 +1,1 @@
+"""Questions that runs which exist can answer; each module is an entry point, and its answer in `results/`."""
