@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from experiments.analyses import claims
-from experiments.runs import populations
+from experiments.analyses import claims, populations
 from srl_jax import data, statistics
 
 SCORES = {"DER, 100 runs": (-20.0, 1.0, -20.0), "SPR, 100 runs": (-18.0, 2.0, -18.2)}

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 from absl import flags
 
-from experiments.analyses import coverage
-from experiments.runs import populations
+from experiments.analyses import coverage, populations
 from srl_jax import statistics
 
 

@@ -1,4 +1,4 @@
-"""Tests of experiments.runs.populations."""
+"""Tests of experiments.analyses.populations."""
 
 import json
 from pathlib import Path
@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from experiments import packing
-from experiments.runs import populations
+from experiments.analyses import populations
 from experiments.runs.run_data import load_run
 from srl_jax.data import Score100k, atari100k
 from srl_jax.errors import ConfigError

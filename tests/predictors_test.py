@@ -7,8 +7,8 @@ import pytest
 from scipy import stats
 
 from experiments.analyses import predictors
+from experiments.analyses.populations import ChosenArm
 from experiments.analyses.predictors import Stratum
-from experiments.runs.populations import ChosenArm
 from experiments.runs.run_data import load_run
 from tests.helpers import write_run
 

@@ -16,15 +16,11 @@ import numpy as np
 from absl import flags
 
 from srl_jax import data, statistics
-from srl_jax.errors import ConfigError
 from srl_jax.files import display
 
 from ..command_line import flags as config_flags
-from ..command_line import paths
 from ..drawing import plots
-from ..reporting import texts
-from ..runs import populations
-from . import coverage
+from . import coverage, output, populations
 
 FLAGS = flags.FLAGS
 SEEDS = (3, 5)
@@ -232,7 +228,7 @@ def tables(found: Mapping[str, Any]) -> str:
             ends = [100 * f(row["arms"].values()) for f in (min, max)]
             fit = "yes" if row["share"] <= ROBUST else "no"
             rows.append([rule, percent(row, "share"), f"{ends[0]:.1f}, {ends[1]:.1f} %", fit])
-        parts.append(f"**Nothing to find, {seeds} seeds an arm**\n\n{texts.markdown(head, rows)}")
+        parts.append(f"**Nothing to find, {seeds} seeds an arm**\n\n{output.markdown(head, rows)}")
     for seeds in map(str, SEEDS):
         head = ["rule", "claims made", "other sign in fresh runs", "claimed again", "exaggeration"]
         rows = []
@@ -240,7 +236,7 @@ def tables(found: Mapping[str, Any]) -> str:
             cells = [percent(row[name], "all") for name in ("claimed", "other sign", "claimed again")]
             size = row["exaggeration"]
             rows.append([rule, *cells, f"{size['all']:.2f} ({size['low']:.2f} to {size['high']:.2f})"])
-        parts.append(f"**Two arms of a game, {seeds} seeds an arm**\n\n{texts.markdown(head, rows)}")
+        parts.append(f"**Two arms of a game, {seeds} seeds an arm**\n\n{output.markdown(head, rows)}")
     for seeds in map(str, SEEDS):
         head = [
             "rule",
@@ -254,13 +250,13 @@ def tables(found: Mapping[str, Any]) -> str:
             [rule, *(f"{value:.2f}" for value in row.values())]
             for rule, row in found["published"][seeds].items()
         ]
-        parts.append(f"**SPR less DER, 26 games, {seeds} seeds an arm**\n\n{texts.markdown(head, rows)}")
+        parts.append(f"**SPR less DER, 26 games, {seeds} seeds an arm**\n\n{output.markdown(head, rows)}")
     kinds = found["interquartile mean"]
     rows = [[kind, *(f"{100 * kinds[str(n)][kind]:.1f} %" for n in SEEDS)] for kind in kinds[str(SEEDS[0])]]
     head = ["interval of the difference", *(f"{n} seeds" for n in SEEDS)]
     parts.append(
         "**Interquartile mean of 26 games, DER against itself: how often an interval leaves out 0**\n\n"
-        + texts.markdown(head, rows)
+        + output.markdown(head, rows)
     )
     return "\n\n".join(parts)
 
@@ -308,19 +304,17 @@ def draw(found: Mapping[str, Any], path: Path) -> Path:
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_string("out", "", "directory for claims.json, .md and .png", flag_values=values)
+    output.define_out("claims.json, .md and .png", values)
 
 
 def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
-    out = paths.check_place("out", FLAGS.out) if FLAGS.out else None
-    if out is not None and not plots.available():
-        raise ConfigError("--out: needs matplotlib and Pillow: pip install 'srl-jax[plots]'")
+    out = output.place(FLAGS.out, drawn=True)
     found = analyse(populations.chosen())
     display.result(tables(found))
     if out is not None:
-        texts.write(out, {"claims.json": json.dumps(found, indent=1), "claims.md": tables(found)})
+        output.write(out, {"claims.json": json.dumps(found, indent=1), "claims.md": tables(found)})
         draw(found, out / "claims.png")
 
 

@@ -18,9 +18,7 @@ from srl_jax.files import display
 from srl_jax.specs import Info
 
 from ..command_line import flags as config_flags
-from ..command_line import paths
-from ..reporting import texts
-from ..runs import populations
+from . import output, populations
 
 FLAGS = flags.FLAGS
 RUNS = (2, 3, 5, 7, 10, 20)
@@ -42,7 +40,7 @@ class Returns(NamedTuple):
 
     Attributes:
         name: in the table.
-        arms: for each game, the populations of its arms, see `runs.populations`: a difference is of two
+        arms: for each game, the populations of its arms, see `populations`: a difference is of two
             different ones of a game, or of the same one twice where the game has no other.
         games: the populations of several games; none has no aggregate.
     """
@@ -267,13 +265,13 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
     info = Info(int, "simulated for each number of the table", minimum=1, maximum=1_000_000)
     config_flags.define("experiments", info, 10_000, values)
-    flags.DEFINE_string("out", "", "directory for coverage.json", flag_values=values)
+    output.define_out("coverage.json", values)
 
 
 def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
-    out = paths.check_place("out", FLAGS.out) if FLAGS.out else None
+    out = output.place(FLAGS.out, drawn=False)
     found = table(FLAGS.experiments, sources())
     display.result("\n".join(lines(found)))
     if out is not None:
@@ -283,7 +281,7 @@ def main(argv: list[str]) -> None:
             "runs": RUNS,
             "covered": found,
         }
-        texts.write(out, {"coverage.json": json.dumps(content, indent=1)})
+        output.write(out, {"coverage.json": json.dumps(content, indent=1)})
 
 
 if __name__ == "__main__":

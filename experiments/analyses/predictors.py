@@ -13,17 +13,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from absl import flags
 
-from srl_jax.errors import ConfigError
 from srl_jax.files import display
 from srl_jax.statistics import ENOUGH
 
 from ..command_line import flags as config_flags
-from ..command_line import paths
 from ..drawing import plots
-from ..reporting import texts
-from ..runs import populations
-from ..runs.populations import ChosenArm
 from ..runs.run_data import RunData
+from . import output, populations
+from .populations import ChosenArm
 
 FLAGS = flags.FLAGS
 MOMENTS = (9_000, 18_000)
@@ -285,7 +282,7 @@ def tables(rows: Sequence[Mapping[str, Any]]) -> str:
                     ]
                 lines.append([*line, verdict(its)])
             title = f"**{level[0].upper()}{level[1:]}, at {moment:,} env steps**"
-            parts.append(f"{title}\n\n{texts.markdown([*head, 'predicts'], lines)}")
+            parts.append(f"{title}\n\n{output.markdown([*head, 'predicts'], lines)}")
     return "\n\n".join(parts)
 
 
@@ -330,20 +327,18 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
 
 def define_flags(values: flags.FlagValues = FLAGS) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_string("out", "", "directory for predictors.json, .md and .png", flag_values=values)
+    output.define_out("predictors.json, .md and .png", values)
 
 
 def main(argv: list[str]) -> None:
     """The entry point."""
     del argv
-    out = paths.check_place("out", FLAGS.out) if FLAGS.out else None
-    if out is not None and not plots.available():
-        raise ConfigError("--out: needs matplotlib and Pillow: pip install 'srl-jax[plots]'")
+    out = output.place(FLAGS.out, drawn=True)
     rows = analyse(populations.chosen())
     display.result(tables(rows))
     if out is not None:
         lines = ",\n".join(f" {json.dumps(row)}" for row in rows)
-        texts.write(out, {"predictors.json": f"[\n{lines}\n]", "predictors.md": tables(rows)})
+        output.write(out, {"predictors.json": f"[\n{lines}\n]", "predictors.md": tables(rows)})
         draw(rows, out / "predictors.png")
 
 

@@ -17,8 +17,8 @@ from srl_jax.errors import ConfigError
 from srl_jax.files.reading import ROWS, read_json
 
 from .. import packing
-from . import collect
-from .run_data import RunData
+from ..runs import collect
+from ..runs.run_data import RunData
 
 RESULTS = Path(__file__).resolve().parents[1] / "results"
 CHOSEN = "catch_runs.json"

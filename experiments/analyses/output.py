@@ -1,0 +1,57 @@
+"""What an analysis writes: --out, and tables and numbers as files."""
+
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+
+from absl import flags
+
+from srl_jax.errors import ConfigError, SaveError
+from srl_jax.files.reading import replace_text
+
+from ..command_line import paths
+from ..drawing import plots
+
+
+def define_out(files: str, values: flags.FlagValues) -> None:
+    """Defines --out; `files` names what is written there."""
+    flags.DEFINE_string("out", "", f"directory for {files}", flag_values=values)
+
+
+def place(given: str, *, drawn: bool) -> Path | None:
+    """The directory of --out, which can be written to; None without one.
+
+    Args:
+        given: the value of --out.
+        drawn: whether a picture goes there, which needs the extra plots.
+
+    Raises:
+        ConfigError: it cannot, or a picture cannot be drawn.
+    """
+    out = paths.check_place("out", given) if given else None
+    if drawn and out is not None and not plots.available():
+        raise ConfigError("--out: needs matplotlib and Pillow: pip install 'srl-jax[plots]'")
+    return out
+
+
+def write(out: Path, texts: Mapping[str, str]) -> None:
+    """Writes texts into a directory, which is made if it is not there; files that are there are replaced.
+
+    Args:
+        out: the directory, of --out.
+        texts: name of the file -> what it holds, less the last line's end.
+
+    Raises:
+        SaveError: one cannot be written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        for name, text in texts.items():
+            replace_text(out / name, text + "\n")
+    except OSError as error:
+        raise SaveError(f"--out={out}: {error.strerror or error}") from error
+
+
+def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    """A table in Markdown."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
