@@ -120,13 +120,13 @@ def test_how_far_a_mean_is_from_published_ones(runs):
 def test_the_stratified_interval_by_hand():
     scores_of = {"a": np.array([0.0, 2.0]), "b": np.array([1.0, 5.0])}
     # Variances of the means 1 and 4: 5 degrees of freedom are 25 / (1 + 16); of the mean of two, root 5 / 2.
-    found = scores.stratified_t(scores_of)
+    found = statistics.stratified_interval(scores_of)
     margin = float(statistics.t_quantile(0.95, 25 / 17)) * np.sqrt(5) / 2
-    assert (found.point, found.kind) == (2.0, scores.STRATIFIED)
+    assert (found.point, found.kind) == (2.0, statistics.STRATIFIED)
     assert (found.low, found.high) == pytest.approx((2 - margin, 2 + margin))
-    one = scores.stratified_t({"a": np.array([0.0, 1.0, 5.0])})
+    one = statistics.stratified_interval({"a": np.array([0.0, 1.0, 5.0])})
     assert one[1:3] == pytest.approx(statistics.mean_interval([0.0, 1.0, 5.0])[1:3])
-    single = scores.stratified_t({"a": np.array([0.0, 2.0]), "b": np.array([1.0])})
+    single = statistics.stratified_interval({"a": np.array([0.0, 2.0]), "b": np.array([1.0])})
     assert np.isnan(single.low) and single.kind == statistics.NONE
 
 
@@ -135,7 +135,7 @@ def test_the_stratified_interval_covers_what_it_says_with_two_runs_of_26_games()
     spreads = rng.uniform(0.01, 0.3, 26)
     hits = 0
     for draws in rng.normal(size=(1000, 26, 2)):
-        found = scores.stratified_t(
+        found = statistics.stratified_interval(
             {str(i): s * x for i, (s, x) in enumerate(zip(spreads, draws, strict=True))}
         )
         hits += found.low <= 0 <= found.high
@@ -149,7 +149,7 @@ def test_aggregates_are_of_the_games_that_all_have(runs):
     normal = {game: statistics.human_normalised(game, [atari100k(RERUN)[game].mean]) for game in GAMES}
     assert rerun["mean"] == pytest.approx(float(statistics.mean(normal)))
     assert rerun["interquartile_mean"] is None  # of runs, of the 26 games alone
-    assert own["mean"]["kind"] == own["optimality_gap"]["kind"] == scores.STRATIFIED
+    assert own["mean"]["kind"] == own["optimality_gap"]["kind"] == statistics.STRATIFIED
     assert own["median"]["kind"] == own["interquartile_mean"]["kind"] == statistics.NARROW
     finished(runs / "Enduro/der/seed0", 5.0, game="Enduro")  # which DER has no published score of
     assert evaluated(runs, [*GAMES, "Enduro"])["aggregated"] == GAMES

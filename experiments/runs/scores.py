@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srl_jax import data, envs, statistics
-from srl_jax.statistics import STUDENT, Interval
 
 from . import collect
 from .json_values import limits, plain
@@ -37,7 +36,6 @@ BESIDE = {
     "mrq": ("MR.Q",),
 }
 """{preset atari100k/NAME: the published methods that its runs are laid beside}, the same recipe first."""
-STRATIFIED = "stratified t"
 
 
 class Score(NamedTuple):
@@ -239,35 +237,11 @@ def _aggregates(raw: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     scores = {game: statistics.human_normalised(game, x) for game, x in raw.items()}
     short = {game: np.maximum(1 - x, 0) for game, x in scores.items()}  # whose mean is the optimality gap
     found = {
-        "mean": stratified_t(scores),
+        "mean": statistics.stratified_interval(scores),
         "median": statistics.estimate(statistics.median, scores),
         "interquartile_mean": statistics.estimate(statistics.interquartile_mean, scores),
         "interquartile_mean_of_means": statistics.estimate(_iqm_of_means, scores),
-        "optimality_gap": stratified_t(short),
+        "optimality_gap": statistics.stratified_interval(short),
         "optimality_gap_of_means": statistics.estimate(_gap_of_means, scores),
     }
     return {name: limits(interval) for name, interval in found.items()}
-
-
-def stratified_t(scores: Mapping[str, np.ndarray], level: float = 0.95) -> Interval:
-    """The mean over games of their means, and its t interval from the variances of runs within each game.
-
-    Runs are independent; each game weighs the same, whatever its spread and number of runs. Degrees of
-    freedom are those of Welch and Satterthwaite: many of many games, even with two runs each, of which a
-    bootstrap is too narrow.
-
-    Args:
-        scores: game -> float64 [runs].
-        level: of the interval.
-
-    Returns:
-        An Interval; its limits are NaN where a game has a single run, or no run differs from another.
-    """
-    variances = np.array([x.var(ddof=1) / len(x) if len(x) > 1 else np.nan for x in scores.values()])
-    point = np.mean([x.mean() for x in scores.values()])
-    total = variances.sum()
-    if not total > 0:
-        return Interval(point, np.float64(np.nan), np.float64(np.nan), statistics.NONE)
-    freedom = total**2 / sum(v**2 / (len(x) - 1) for v, x in zip(variances, scores.values(), strict=True))
-    margin = statistics.t_quantile(level, freedom) * np.sqrt(total) / len(scores)
-    return Interval(point, point - margin, point + margin, STRATIFIED if len(scores) > 1 else STUDENT)

@@ -54,6 +54,7 @@ from srl_jax.statistics.intervals import (
     ENOUGH,
     NARROW,
     NONE,
+    STRATIFIED,
     STUDENT,
     WELCH,
     Interval,
@@ -63,7 +64,14 @@ from srl_jax.statistics.intervals import (
     percentile_interval,
 )
 from srl_jax.statistics.power import MOST, runs_needed, smallest_effect, welch_power
-from srl_jax.statistics.student import mean_difference, mean_interval, t_probability, t_quantile, welch_p
+from srl_jax.statistics.student import (
+    mean_difference,
+    mean_interval,
+    stratified_interval,
+    t_probability,
+    t_quantile,
+    welch_p,
+)
 from srl_jax.statistics.table import runs_text, summary
 
 __all__ = [
@@ -73,6 +81,7 @@ __all__ = [
     "MOST",
     "NARROW",
     "NONE",
+    "STRATIFIED",
     "STUDENT",
     "WELCH",
     "Interval",
@@ -100,6 +109,7 @@ __all__ = [
     "runs_text",
     "smallest_effect",
     "steps_to",
+    "stratified_interval",
     "summary",
     "t_probability",
     "t_quantile",

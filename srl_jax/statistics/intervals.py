@@ -11,7 +11,7 @@ REPETITIONS = 10_000
 """How often the bootstrap draws again where nothing else is asked for: its limits then vary by about a
 hundredth of their distance with the seed of the draws."""
 
-STUDENT, WELCH, BOOTSTRAP = "Student's t", "Welch's t", "stratified bootstrap"
+STUDENT, WELCH, STRATIFIED, BOOTSTRAP = "Student's t", "Welch's t", "stratified t", "stratified bootstrap"
 NARROW, NONE = "stratified bootstrap, too narrow", "none"
 ENOUGH = 5
 """Runs of each game from which the bootstrap's interval is not called too narrow."""
@@ -28,8 +28,8 @@ class Interval(NamedTuple):
         low: float64 of the same shape, the interval's lower limit; NaN where there is none, as with a game
             that has a single run.
         high: float64 of the same shape, the upper limit, likewise.
-        kind: how it was made: STUDENT, WELCH, BOOTSTRAP, NARROW (a bootstrap of fewer than `ENOUGH` runs of
-            some game) or NONE (of a single run).
+        kind: how it was made: STUDENT, WELCH, STRATIFIED (t, of several games), BOOTSTRAP, NARROW (a
+            bootstrap of fewer than `ENOUGH` runs of some game) or NONE (of a single run).
     """
 
     point: np.ndarray

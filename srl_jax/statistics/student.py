@@ -5,11 +5,12 @@ known with a width that grows as runs get fewer. `srl_jax/statistics/__init__.py
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from srl_jax.statistics.intervals import NONE, STUDENT, WELCH, Interval, check_level
+from srl_jax.statistics.intervals import NONE, STRATIFIED, STUDENT, WELCH, Interval, check_level
 
 _AT = np.linspace(-3.2, 3.2, 81)
 _NODES = np.tanh(np.pi / 2 * np.sinh(_AT))
@@ -34,6 +35,30 @@ def mean_interval(x: Any, level: float = 0.95) -> Interval:
     """
     point, variance, freedom = _moments(x)
     return _interval(point, variance, freedom or np.nan, level, STUDENT if freedom else NONE)
+
+
+def stratified_interval(scores: Mapping[str, Any], level: float = 0.95) -> Interval:
+    """The mean over games of their means, and its t interval from the variances of runs within each game.
+
+    Runs are independent; each game weighs the same, whatever its spread and number of runs. Degrees of
+    freedom are those of Welch and Satterthwaite: many of many games, even with two runs each, of which a
+    bootstrap is too narrow.
+
+    Args:
+        scores: game -> float64 [runs].
+        level: of the interval.
+
+    Returns:
+        An Interval; its limits are NaN where a game has a single run, or no run differs from another.
+
+    Raises:
+        ValueError: see `mean_interval`.
+    """
+    means, variances, runs = map(np.array, zip(*map(_moments, scores.values()), strict=True))
+    total = _spread(variances.sum())
+    freedom = total**2 / (variances**2 / np.maximum(runs, 1)).sum()
+    kind = (STRATIFIED if len(means) > 1 else STUDENT) if np.isfinite(total) else NONE
+    return _interval(means.mean(), total / len(means) ** 2, freedom, level, kind)
 
 
 def mean_difference(x: Any, y: Any, level: float = 0.95) -> Interval:
