@@ -19,9 +19,12 @@ STAMP := $(VENV)/.installed-$(or $(VERSION),none)
 unless = $(if $(findstring $(1),$(ARGS)),,$(1)$(2))
 
 # Tests that start few processes and compile little, half a minute in all.
-FAST := actor api_docs arms augment colours compare config control_groups data diagnostics_measures docs \
-	ending envs_base help metrics optim plots protocols reading replay replay_machine rl_losses run_data rundir specs \
-	statistics sumtree sweeping_plan sweeping_status window
+FAST := augment config data/data diagnostics/measures envs/base experiments/arms \
+	experiments/command_line/control_groups experiments/command_line/help experiments/compare \
+	experiments/drawing/colours experiments/drawing/plots experiments/protocols \
+	experiments/runs/run_data experiments/sweeping/plan experiments/sweeping/status files/metrics \
+	files/reading files/rundir learning/optim project/api_docs project/docs replay/machine replay/replay \
+	replay/sumtree rl/losses run/actor run/ending specs statistics/statistics window
 
 .DEFAULT_GOAL := help
 .PHONY: help install check test train lint docs soak bench bench-gpu bench-install
@@ -29,7 +32,7 @@ FAST := actor api_docs arms augment colours compare config control_groups data d
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
 	@echo 'PYTHON=python3.12 chooses the interpreter (3.11 to 3.13); ARGS="..." is added to the command,'
-	@echo 'as in: make train ARGS="--seed=1"   make test ARGS="tests/replay_test.py"'
+	@echo 'as in: make train ARGS="--seed=1"   make test ARGS="tests/replay/replay_test.py"'
 
 install: $(STAMP) ## make .venv with everything that the other targets need
 

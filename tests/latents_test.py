@@ -26,7 +26,7 @@ from srl_jax.learning.update import (
 from srl_jax.plugins import Registry
 from srl_jax.window import observation
 from tests.helpers import jit
-from tests.update_test import PIXELS, RATES, SMALL, make_peek, make_peeks
+from tests.learning.update_test import PIXELS, RATES, SMALL, make_peek, make_peeks
 
 _shift = jit(make_view("shift"))
 

@@ -11,7 +11,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.files.metrics import read_metrics
 from srl_jax.run import ending
 from srl_jax.training import check_sources, completed, resolved
-from tests.checkpoint_test import CONFIG, write
+from tests.files.checkpoint_test import CONFIG, write
 from tests.helpers import SMALL
 
 pytestmark = pytest.mark.usefixtures("shared_agents")

@@ -48,9 +48,8 @@ MULTIPLY_ADDS = {
     "der": 1.3, "tiny": 2.1, "nature": 7.8, "mrq": 12.8, "a_lix": 32.4, "sac_ae": 51.6, "impala": 54.7
 }  # fmt: skip
 """{encoder: millions of multiplications with an addition} that one observation of 84 x 84 x 4 takes with the
-default options, as XLA counts them (`tests/runtime_test.py`). An encoder's size decides what helps it on a
-CPU, and has to be known before jax is imported. An encoder that is not listed, a user's own, counts as the
-largest."""
+default options, as XLA counts them. An encoder's size decides what helps it on a CPU, and has to be known
+before jax is imported. An encoder that is not listed, a user's own, counts as the largest."""
 
 _YNN = "--xla_cpu_experimental_ynn_fusion_type=LIBRARY_FUSION_TYPE_INDIVIDUAL_DOT,LIBRARY_FUSION_TYPE_REDUCE"
 XLA_FLAGS = {"0.10": (_YNN,), "0.11": (_YNN,), "0.12": (_YNN,)}

@@ -149,7 +149,7 @@ TRAIN_ROW = {"kind": "train", "env_steps": 0, "updates": 0, "wall_s": 1.0}
 
 
 def test_rows_with_other_values(refused, source):
-    # tests/draw_test.py has more.
+    # tests/experiments/drawing/run_figures_test.py has more.
     rows = [{key: ROW[key] for key in ROW if key != gone} for gone in ("kind", "env_steps")]
     rows += [ROW | {"kind": CODE}]
     rows += [ROW | {"env_steps": x} for x in ("many", None, 10**400, [0, 1], -1)]

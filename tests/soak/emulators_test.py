@@ -3,13 +3,13 @@
 import pytest
 
 from srl_jax import envs
-from tests.players import MOMENTS, Player, goes_on
+from tests.envs.players import MOMENTS, Player, goes_on
 
 pytest.importorskip("ale_py")
 cv2 = pytest.importorskip("cv2")
 
-from tests.beside_gymnasium import NOOP_MAX, beside  # noqa: E402
-from tests.recorder import Watched  # noqa: E402
+from tests.envs.beside_gymnasium import NOOP_MAX, beside  # noqa: E402
+from tests.run.recorder import Watched  # noqa: E402
 
 STEPS = 200
 TEN_GAMES = (

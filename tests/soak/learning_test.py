@@ -1,8 +1,8 @@
-"""It learns: the modes that tests/learning_test.py leaves out, by the same limits."""
+"""It learns: the modes that tests/run/learning_test.py leaves out, by the same limits."""
 
 import pytest
 
-from tests.learning_test import run
+from tests.run.learning_test import run
 
 
 @pytest.fixture(scope="module")

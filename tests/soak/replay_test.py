@@ -1,11 +1,11 @@
-"""A million operations on replays beside their reference, see `tests/replay_machine.py`."""
+"""A million operations on replays beside their reference, see `tests/replay/machine.py`."""
 
 from collections import Counter
 
 from hypothesis import seed, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from tests.replay_machine import SETTINGS, ReplayMachine
+from tests.replay.machine import SETTINGS, ReplayMachine
 
 
 def test_replay_does_what_an_obvious_reference_does(amount, progress, record_property, monkeypatch):
