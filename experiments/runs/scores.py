@@ -235,13 +235,12 @@ def _aggregates(raw: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     if not raw:
         return {}
     scores = {game: statistics.human_normalised(game, x) for game, x in raw.items()}
-    short = {game: np.maximum(1 - x, 0) for game, x in scores.items()}  # whose mean is the optimality gap
     found = {
-        "mean": statistics.stratified_interval(scores),
+        "mean": statistics.estimate(statistics.mean, scores),
         "median": statistics.estimate(statistics.median, scores),
         "interquartile_mean": statistics.estimate(statistics.interquartile_mean, scores),
         "interquartile_mean_of_means": statistics.estimate(_iqm_of_means, scores),
-        "optimality_gap": statistics.stratified_interval(short),
+        "optimality_gap": statistics.estimate(statistics.optimality_gap, scores),
         "optimality_gap_of_means": statistics.estimate(_gap_of_means, scores),
     }
     return {name: limits(interval) for name, interval in found.items()}

@@ -49,6 +49,35 @@ def interquartile_mean(scores: Scores) -> np.ndarray:
     A quarter is rounded down to whole runs. Where games have different numbers of runs, each run counts as
     many times as makes all games equal.
     """
+    values, kept, _ = _middle(scores)
+    return (kept * values).sum(-1)
+
+
+def interquartile_terms(scores: Scores) -> dict[str, np.ndarray]:
+    """What each run adds to the interquartile mean, so that the mean over games of their means is that.
+
+    It is the run's score, no further out than the outermost one that is kept, over the share that is kept,
+    less a constant. How these vary says how much the interquartile mean varies: they are its influence
+    function (Huber, "Robust Statistics", 1981, section 3.3).
+
+    Returns:
+        game -> float64 [..., runs].
+    """
+    values, kept, share = _middle(scores)
+    inside = np.where(kept > 0, values, np.nan)
+    low, high = np.nanmin(inside, -1)[..., None], np.nanmax(inside, -1)[..., None]
+    terms = {game: np.clip(x, low, high) / share for game, x in by_game(scores).items()}
+    shift = (kept * values).sum(-1) - mean(terms)
+    return {game: x + shift[..., None] for game, x in terms.items()}
+
+
+def _middle(scores: Scores) -> tuple[np.ndarray, np.ndarray, float]:
+    """What is left without the lowest and the highest quarter.
+
+    Returns:
+        The runs of all games from the lowest to the highest, float64 [..., runs of all games]; the weight of
+        each in the interquartile mean, likewise; and which share of all weight that is of.
+    """
     games = list(by_game(scores).values())
     common = lcm(*(game.shape[-1] for game in games))  # of many different numbers, larger than any float
     unit = min(common, _EXACT)
@@ -59,7 +88,7 @@ def interquartile_mean(scores: Scores) -> np.ndarray:
     total = unit * len(games)
     cut = common * len(games) // 4 * unit / common
     kept = np.diff(np.clip(upto, cut, total - cut), axis=-1, prepend=cut)
-    return (kept * np.take_along_axis(values, order, -1)).sum(-1) / (total - 2 * cut)
+    return np.take_along_axis(values, order, -1), kept / (total - 2 * cut), (total - 2 * cut) / total
 
 
 def optimality_gap(scores: Scores, threshold: float = 1.0) -> np.ndarray:

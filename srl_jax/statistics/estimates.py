@@ -2,8 +2,11 @@
 
 - A mean over the runs of one game: the t interval, Student's of an arm, Welch's of a difference. Where
   returns are normal it covers what it says from two runs on, and with many it is the bootstrap's.
-- All else, that is aggregates over several games and what is no mean (the interquartile mean, the median run,
-  the probability of improvement, profiles): the stratified bootstrap, which is too narrow with few runs.
+- A mean over games of such means: the t interval from the spread of runs within games, likewise.
+- The interquartile mean of `MANY` games or more with fewer than `FEW` runs of some: the same, of what each
+  run adds to it.
+- All else (the interquartile mean of few games or of many runs, the median game, the probability of
+  improvement, profiles): the stratified bootstrap, which is too narrow with few runs.
 - A single run: none.
 """
 
@@ -17,6 +20,8 @@ from srl_jax.statistics.aggregates import (
     Statistic,
     by_game,
     check_games,
+    interquartile_mean,
+    interquartile_terms,
     mean,
     median,
     optimality_gap,
@@ -29,10 +34,12 @@ from srl_jax.statistics.intervals import (
     bootstrap_difference,
     curves_by_game,
 )
-from srl_jax.statistics.student import mean_difference, mean_interval
+from srl_jax.statistics.student import contrast, mean_difference, stratified_interval
 
-MEANS = (mean, median, optimality_gap)
-"""Statistics that, of one game, are the mean of what they are of each run alone."""
+MEANS = (mean, optimality_gap)
+"""Statistics that are the mean over games of the mean of what they are of each run alone."""
+FEW, MANY = 10, 5
+"""Runs of a game, and games: see above."""
 
 
 def estimate(
@@ -50,8 +57,8 @@ def estimate(
     Raises:
         ValueError: see `bootstrap`.
     """
-    if len(arms) == 1 and (runs := _runs(statistic, by_game(arms[0]))) is not None:
-        return mean_interval(runs, level)
+    if len(arms) == 1 and (terms := _terms(statistic, by_game(arms[0]))) is not None:
+        return stratified_interval(terms, level)
     return bootstrap(statistic, *arms, repetitions=repetitions, level=level, seed=seed)
 
 
@@ -77,8 +84,12 @@ def estimate_difference(
     """
     ours, theirs = by_game(x), by_game(y)
     check_games(ours, theirs)
-    if (runs := _runs(statistic, ours)) is not None:
-        return mean_difference(runs, _runs(statistic, theirs), level)
+    mine, base = _terms(statistic, ours), _terms(statistic, theirs)
+    if mine is not None and base is not None:
+        if len(mine) == 1:
+            return mean_difference(*mine.values(), *base.values(), level)
+        weights = np.repeat([1 / len(mine), -1 / len(base)], len(mine))
+        return contrast([*mine.values(), *base.values()], weights, level)
     return bootstrap_difference(ours, theirs, statistic, level=level, **how)
 
 
@@ -98,13 +109,15 @@ def curve_interval(returns: Any, statistic: Statistic = mean, *, level: float = 
         ValueError: the curves have another form, or see `bootstrap`.
     """
     games = curves_by_game(returns)
-    if (runs := _runs(statistic, games)) is not None:
-        return mean_interval(runs, level)
+    if (terms := _terms(statistic, games)) is not None:
+        return stratified_interval(terms, level)
     return bootstrap_curve(returns, statistic, level=level, **how)
 
 
-def _runs(statistic: Statistic, games: Mapping[str, np.ndarray]) -> np.ndarray | None:
-    """The values of runs, [..., runs], that the statistic is the mean of; None where it is no such mean."""
-    if len(games) != 1 or statistic not in MEANS:
-        return None
-    return statistic({game: x[..., None] for game, x in games.items()})
+def _terms(statistic: Statistic, games: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
+    """game -> [..., runs], whose means have the statistic as their mean; None where there are no such."""
+    if statistic in MEANS or (statistic is median and len(games) == 1):
+        return {game: statistic({game: x[..., None]}) for game, x in games.items()}
+    if statistic is interquartile_mean and len(games) >= MANY:
+        return interquartile_terms(games) if min(x.shape[-1] for x in games.values()) < FEW else None
+    return None

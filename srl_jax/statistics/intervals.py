@@ -28,7 +28,7 @@ class Interval(NamedTuple):
         low: float64 of the same shape, the interval's lower limit; NaN where there is none, as with a game
             that has a single run.
         high: float64 of the same shape, the upper limit, likewise.
-        kind: how it was made: STUDENT, WELCH, STRATIFIED (t, of several games), BOOTSTRAP, NARROW (a
+        kind: how it was made: STUDENT, WELCH, STRATIFIED (t, of several groups of runs), BOOTSTRAP, NARROW (a
             bootstrap of fewer than `ENOUGH` runs of some game) or NONE (of a single run).
     """
 

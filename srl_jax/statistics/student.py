@@ -5,7 +5,7 @@ known with a width that grows as runs get fewer. `srl_jax/statistics/__init__.py
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,20 +45,46 @@ def stratified_interval(scores: Mapping[str, Any], level: float = 0.95) -> Inter
     bootstrap is too narrow.
 
     Args:
-        scores: game -> float64 [runs].
-        level: of the interval.
+        scores: game -> float64 [..., runs].
+        level: of each interval.
 
     Returns:
-        An Interval; its limits are NaN where a game has a single run, or no run differs from another.
+        An Interval of arrays [...]; its limits are NaN where a game has a single run, or no run differs from
+        another.
 
     Raises:
         ValueError: see `mean_interval`.
     """
-    means, variances, runs = map(np.array, zip(*map(_moments, scores.values()), strict=True))
-    total = _spread(variances.sum())
-    freedom = total**2 / (variances**2 / np.maximum(runs, 1)).sum()
-    kind = (STRATIFIED if len(means) > 1 else STUDENT) if np.isfinite(total) else NONE
-    return _interval(means.mean(), total / len(means) ** 2, freedom, level, kind)
+    if len(scores) == 1:
+        return mean_interval(*scores.values(), level)
+    return contrast(list(scores.values()), np.full(len(scores), 1 / len(scores)), level)
+
+
+def contrast(groups: Sequence[Any], weights: Any, level: float = 0.95) -> Interval:
+    """A weighted sum of means of groups of runs, and its t interval; `mean_difference` is that of 1 and -1.
+
+    So a difference of two differences has weights 1, -1, -1 and 1. Runs are independent; numbers of runs and
+    spreads may differ. Degrees of freedom are those of Satterthwaite (Biometrics Bulletin 2, 1946).
+
+    Args:
+        groups: float64 [..., runs] each.
+        weights: float64 [groups].
+        level: of each interval.
+
+    Returns:
+        An Interval of arrays [...]; its limits are NaN where a group has a single run, or no run differs from
+        another.
+
+    Raises:
+        ValueError: see `mean_interval`.
+    """
+    means, variances, freedoms = zip(*map(_moments, groups), strict=True)
+    parts = [weight**2 * variance for weight, variance in zip(weights, variances, strict=True)]
+    total = _spread(np.sum(parts, axis=0))
+    lost = [part**2 / max(freedom, 1) for part, freedom in zip(parts, freedoms, strict=True)]
+    point = np.sum([weight * x for weight, x in zip(weights, means, strict=True)], axis=0)
+    kind = STRATIFIED if min(freedoms) else NONE
+    return _interval(point, total, total**2 / np.sum(lost, axis=0), level, kind)
 
 
 def mean_difference(x: Any, y: Any, level: float = 0.95) -> Interval:

@@ -10,12 +10,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from experiments.analyses import coverage
 from srl_jax import statistics
 from srl_jax.statistics import (
     area_under_curve,
     at_equal_steps,
     bootstrap,
     bootstrap_difference,
+    contrast,
     curve_interval,
     estimate,
     estimate_difference,
@@ -32,11 +34,13 @@ from srl_jax.statistics import (
     reached,
     runs_text,
     steps_to,
+    stratified_interval,
     summary,
     t_probability,
     t_quantile,
     welch_p,
 )
+from srl_jax.statistics.aggregates import interquartile_terms
 
 with warnings.catch_warnings():  # what other packages warn of while they are imported
     warnings.simplefilter("ignore")
@@ -226,6 +230,17 @@ def test_t_intervals_of_hand_worked_scores():
     )
 
 
+def test_a_contrast_by_hand():
+    """Means 1, 2, 4 and 6, whose variances are 1, 4, 0 and 1, with 1, 1, 1 and 2 degrees of freedom."""
+    groups = [0.0, 2.0], [0.0, 4.0], [4.0, 4.0], [6 - 3**0.5, 6.0, 6 + 3**0.5]
+    found = contrast(groups, (1, -1, -1, 1))
+    margin = float(t_quantile(0.95, 36 / (1 + 16 + 1 / 2))) * 6**0.5
+    assert found[:3] == pytest.approx((1, 1 - margin, 1 + margin)) and found.kind == "stratified t"
+    two = contrast(([5, 6, 7], [1, 3, 2.5]), (1, -1))
+    assert two[:3] == pytest.approx(mean_difference([5, 6, 7], [1, 3, 2.5])[:3])
+    assert np.isnan(contrast(([1.0], [0.0, 1.0]), (1, -1)).low)
+
+
 def test_t_is_scipys():
     freedom = np.array([1, 1.01, 1.4, 2, 2.5, 3, 4, 7.7, 10, 30, 100, 1000])
     for level in (0.1, 0.5, 0.9, 0.95, 0.99, 0.999):
@@ -290,15 +305,48 @@ def test_which_interval_is_right_for_what():
     assert estimate(optimality_gap, one)[:3] == pytest.approx(mean_interval([1.0, 0.0, 0.0])[:3])
     assert estimate_difference(one, other) == mean_difference(one["a"], other["a"])
     # All else is drawn again, and too narrow with fewer than five runs of some game.
-    for statistic in (mean, median, optimality_gap):
+    for statistic in (median, interquartile_mean):
         assert estimate(statistic, two) == bootstrap(statistic, two)
     assert estimate(interquartile_mean, one) == bootstrap(interquartile_mean, one)
     assert estimate(probability_of_improvement, one, other).kind == statistics.NARROW
-    assert estimate_difference(two, two).kind == statistics.NARROW
-    assert estimate(mean, SCORES).kind == statistics.BOOTSTRAP
-    assert curve_interval(np.ones((3, 2, 4)) * [[[1.0]], [[2.0]], [[3.0]]]).kind == statistics.NARROW
+    assert estimate_difference(two, two, median).kind == statistics.NARROW
+    # Means over games have the t interval of runs within games.
+    assert estimate(mean, two) == stratified_interval(two)
+    assert estimate(optimality_gap, two)[:3] == pytest.approx(
+        stratified_interval({"a": [1.0, 0.0, 0.0], "b": [0.0, 0.0]})[:3]
+    )
+    difference = estimate_difference(two, {"a": [1.0, 2.0], "b": [0.0, 5.0, 7.0]})
+    groups = [*two.values(), [1.0, 2.0], [0.0, 5.0, 7.0]]
+    assert difference == contrast(groups, (0.5, 0.5, -0.5, -0.5))
+    curves = np.arange(24.0).reshape(3, 2, 4) ** 2
+    found = curve_interval(curves)
+    assert [x[1] for x in found[:3]] == pytest.approx(estimate(mean, curves[..., 1])[:3])
     with pytest.raises(ValueError, match="the games differ: a, b and a"):
         estimate_difference(two, one)
+
+
+def test_the_interval_of_an_interquartile_mean_with_few_runs():
+    scores = np.random.default_rng(1).normal(size=(3, 6)) * [1, 2, 0.5, 3, 1, 1] + [0, 1, -1, 2, 5, 0]
+    found = estimate(interquartile_mean, scores)
+    point, variances = coverage.interquartile_mean(scores)  # written on its own
+    assert found.kind == statistics.STRATIFIED and found.point == pytest.approx(point)
+    freedom = variances.sum() ** 2 / (variances**2 / 2).sum()
+    assert found.high - point == pytest.approx(float(t_quantile(0.95, freedom)) * variances.sum() ** 0.5)
+    assert estimate(interquartile_mean, scores[:, :4]).kind == statistics.NARROW  # of few games
+    assert estimate(interquartile_mean, np.tile(scores, (4, 1))).kind == statistics.BOOTSTRAP  # of many runs
+    # With other numbers of runs, too, the terms' mean is the interquartile mean, also under leading axes.
+    games = {str(i): scores[None, : 2 + i % 2, i] * [[1.0], [-1.0]] for i in range(6)}
+    assert mean(interquartile_terms(games)) == pytest.approx(interquartile_mean(games))
+
+
+def test_it_covers_what_it_says():
+    """With three runs of each of 26 games, where the bootstrap has 86 %."""
+    rng = np.random.default_rng(0)
+    centres, spreads = rng.normal(size=26), rng.uniform(0.1, 1, 26)
+    truth = float(interquartile_mean(centres + spreads * rng.normal(size=(20_000, 26))))
+    draws = centres + spreads * rng.normal(size=(400, 3, 26))
+    found = [estimate(interquartile_mean, scores) for scores in draws]
+    assert 0.91 < np.mean([x.low <= truth <= x.high for x in found]) < 0.99
 
 
 def test_the_interquartile_mean_of_many_different_numbers_of_runs():
