@@ -86,10 +86,10 @@ def estimate_difference(
     check_games(ours, theirs)
     mine, base = _terms(statistic, ours), _terms(statistic, theirs)
     if mine is not None and base is not None:
+        groups = [*mine.values(), *base.values()]
         if len(mine) == 1:
-            return mean_difference(*mine.values(), *base.values(), level)
-        weights = np.repeat([1 / len(mine), -1 / len(base)], len(mine))
-        return contrast([*mine.values(), *base.values()], weights, level)
+            return mean_difference(groups[0], groups[1], level)
+        return contrast(groups, np.repeat([1 / len(mine), -1 / len(mine)], len(mine)), level)
     return bootstrap_difference(ours, theirs, statistic, level=level, **how)
 
 

@@ -56,7 +56,7 @@ def stratified_interval(scores: Mapping[str, Any], level: float = 0.95) -> Inter
         ValueError: see `mean_interval`.
     """
     if len(scores) == 1:
-        return mean_interval(*scores.values(), level)
+        return mean_interval(next(iter(scores.values())), level)
     return contrast(list(scores.values()), np.full(len(scores), 1 / len(scores)), level)
 
 
