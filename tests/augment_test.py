@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from srl_jax.augment import make_view, random_shift
-from tests.helpers import jit
 
 
 def shifts(frames, pad):
@@ -22,7 +21,7 @@ def shifts(frames, pad):
 
 def draw(frames, pad, number, seed=0):
     keys = jax.random.split(jax.random.key(seed), number)
-    return np.asarray(jit(jax.vmap(lambda key: random_shift(jnp.asarray(frames), key, pad)))(keys))
+    return np.asarray(jax.jit(jax.vmap(lambda key: random_shift(jnp.asarray(frames), key, pad)))(keys))
 
 
 def test_a_shift_by_hand():
@@ -59,7 +58,7 @@ def test_four_pixels_is_the_default_and_none_the_identity():
     frames = np.random.default_rng(0).integers(0, 256, (1, 20, 20, 1), dtype=np.uint8)
     keys = jax.random.split(jax.random.key(0), 200)
     allowed = {shifted.tobytes() for shifted in shifts(frames, 4).values()}
-    results = np.asarray(jit(jax.vmap(lambda key: random_shift(jnp.asarray(frames), key)))(keys))
+    results = np.asarray(jax.jit(jax.vmap(lambda key: random_shift(jnp.asarray(frames), key)))(keys))
     found = {np.ascontiguousarray(shifted).tobytes() for shifted in results}
     assert found <= allowed
     assert len(found) > 60  # 81 shifts; 3 pixels would have 49

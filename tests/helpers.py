@@ -47,9 +47,6 @@ NOT_FINITE = Ending("diverged", 330, "loss/rl is not finite after 330 env steps 
 """How a run ended that diverged."""
 
 
-jit = jax.jit
-"""What conftest.py tells XLA makes it fast."""
-
 HOST_ONLY = (
     "game", "seed", "steps", "buffer_size", "updates_per_step", "learn_start", "gamma", "lr_final_share",
     "beta", "beta_final", "eval_every", "eval_games", "eval_max_steps", "final_games", "eval_envs",

@@ -25,10 +25,9 @@ from srl_jax.learning.update import (
 )
 from srl_jax.plugins import Registry
 from srl_jax.window import observation
-from tests.helpers import jit
 from tests.learning.update_test import PIXELS, RATES, SMALL, make_peek, make_peeks
 
-_shift = jit(make_view("shift"))
+_shift = jax.jit(make_view("shift"))
 
 
 def test_each_augmentation_and_who_sees_it():
@@ -39,7 +38,7 @@ def test_each_augmentation_and_who_sees_it():
     for name, (rl_view, representation_view) in views.items():
         seen = Views.of(Config(augment=name))
         init, update, hyper = make_peeks(RL, "peek", views=seen, form="summed")
-        _, _, metrics = jit(update)(init(key), SMALL, hyper)
+        _, _, metrics = jax.jit(update)(init(key), SMALL, hyper)
         for loss, view in ((RL, rl_view), ("peek", representation_view)):
             np.testing.assert_array_equal(metrics[f"{loss}/frames"], view, err_msg=f"{name} {loss}")
             # The latents are those of the same view.
@@ -55,7 +54,9 @@ def seen_by(views):
     optimizer, mode = make_optimizer(terms), MODES["joint"]
     state = make_init(PIXELS, terms, mode, optimizer)(jax.random.key(3))
     scale = float(state.params["encoder"]["scale"][0])
-    update = jit(make_update(PIXELS, terms, mode, optimizer, plan=passes(mode, terms, "summed"), views=views))
+    update = jax.jit(
+        make_update(PIXELS, terms, mode, optimizer, plan=passes(mode, terms, "summed"), views=views)
+    )
     _, _, metrics = update(state, SMALL, Hyper({RL: 1.0, "peek": 1.0}, RATES))
     # Latents are pixels times a number: pixels again.
     return {n: np.asarray(x) / (1 if n.endswith("frames") else scale) for n, x in metrics.items() if "/" in n}
@@ -148,7 +149,7 @@ def test_each_row_has_a_shift_of_its_own():
     same = SMALL._replace(frames=np.broadcast_to(SMALL.frames[:1], SMALL.frames.shape))
     rows = [row for seed in range(5) for row in np.asarray(_shift(same, jax.random.key(seed)).frames)]
     assert len({row.tobytes() for row in rows}) > 12  # 20 draws of 81 shifts
-    one = jit(random_shift)(same.frames[2], jax.random.split(jax.random.key(0), 4)[2])
+    one = jax.jit(random_shift)(same.frames[2], jax.random.split(jax.random.key(0), 4)[2])
     np.testing.assert_array_equal(rows[2], one)  # the whole row, all its frames, by one draw
 
 

@@ -7,7 +7,6 @@ import pytest
 
 from srl_jax import layers
 from srl_jax.layers import Conv, ConvTranspose, Dense, NoisyDense, WideDense
-from tests.helpers import jit
 
 
 def transposed(x, kernel, bias, stride, size):
@@ -52,7 +51,7 @@ def test_conv_is_the_plain_convolution_in_values_and_gradients(kernel, stride, h
             dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest",
         )  # fmt: skip
 
-    @jit
+    @jax.jit
     def both(params, x):
         def of(f):
             if dtype == np.uint8:
@@ -128,7 +127,7 @@ def test_conv_transpose_is_the_dilated_convolution_in_values_and_gradients(kerne
         "bias": rng.normal(size=5).astype(np.float32),
     }
 
-    @jit
+    @jax.jit
     def both(params, x):
         ours, pull = jax.vjp(lambda p, x: layer.apply({"params": p}, x), params, x)
         reference = lambda p, x: transposed(x, p["kernel"], p["bias"], stride, size)  # noqa: E731
@@ -147,7 +146,7 @@ def test_conv_transpose_in_forward_mode():
     kernel, kernel_dot = rng.normal(size=(2, 3, 3, 3, 5)).astype(np.float32)
     bias = np.zeros(5, np.float32)
 
-    @jit
+    @jax.jit
     def tangents(x, x_dot, kernel, kernel_dot):
         def of(f):
             both = jax.jvp(f, (kernel, x), (kernel_dot, x_dot))[1]
@@ -169,7 +168,7 @@ def test_wide_dense_is_dense_with_a_transposed_kernel_in_values_and_gradients():
         "bias": rng.normal(size=40).astype(np.float32),
     }
 
-    @jit
+    @jax.jit
     def both(params, x):
         def of(f):
             y, pull = jax.vjp(f, params, x)
@@ -188,7 +187,7 @@ def test_conv_transpose_by_hand():
     x = np.array([[1.0, 2.0], [3.0, 4.0]], np.float32)[None, :, :, None]
     kernel = np.array([[1.0, 10.0], [100.0, 1000.0]], np.float32)[:, :, None, None]
     layer = ConvTranspose(1, 2, 2, (5, 5))
-    y = jit(layer.apply)({"params": {"kernel": kernel, "bias": np.array([0.5], np.float32)}}, x)
+    y = jax.jit(layer.apply)({"params": {"kernel": kernel, "bias": np.array([0.5], np.float32)}}, x)
     expected = [
         [1, 10, 2, 20, 0],
         [100, 1000, 200, 2000, 0],
@@ -264,7 +263,7 @@ def test_every_layer_knows_its_fan_in(monkeypatch):
 
 def test_a_convolution_starts_as_asked():
     def start(**options):
-        return jit(Conv(64, 5, 1, **options).init)(jax.random.key(0), jnp.zeros((1, 5, 5, 4)))["params"]
+        return jax.jit(Conv(64, 5, 1, **options).init)(jax.random.key(0), jnp.zeros((1, 5, 5, 4)))["params"]
 
     # PyTorch's default, U(-1/sqrt(fan_in), 1/sqrt(fan_in)), with 5 * 5 * 4 = 100 inputs.
     textbook, he, centred = start(), start(initial="he"), start(zero_sum=True)
@@ -279,7 +278,7 @@ def test_a_convolution_starts_as_asked():
 def test_init_scale_multiplies_the_kernel():
     x = jnp.zeros((1, 3, 3, 2))
     whole, tenth = (
-        jit(ConvTranspose(4, 4, 2, (8, 8), "he", scale).init)(jax.random.key(0), x)["params"]
+        jax.jit(ConvTranspose(4, 4, 2, (8, 8), "he", scale).init)(jax.random.key(0), x)["params"]
         for scale in (1.0, 0.1)
     )
     np.testing.assert_allclose(tenth["kernel"], 0.1 * whole["kernel"], rtol=1e-5)
@@ -303,7 +302,7 @@ def test_noisy_dense_by_hand():
         "bias": np.array([3.0]), "bias_sigma": np.array([0.4]),
     }  # fmt: skip
     params = jax.tree.map(np.float32, params)
-    apply = jit(lambda x, noise: NoisyDense(1).apply({"params": params}, x, noise))
+    apply = jax.jit(lambda x, noise: NoisyDense(1).apply({"params": params}, x, noise))
     x = np.array([[1, 0], [0, 1], [10, 1]], np.float32)
     y = apply(x, np.array([2, -3, 0.5], np.float32))
     np.testing.assert_allclose(y[:, 0], [1.1 + 3.2, 1.7 + 3.2, 11 + 1.7 + 3.2], rtol=1e-6)
@@ -320,7 +319,7 @@ def test_noisy_dense_is_the_same_for_few_and_for_many_rows():
     layer = NoisyDense(20, 2.0)
     params = layer.init(jax.random.key(0), few, None)["params"]
 
-    @jit
+    @jax.jit
     def run(x, cotangent):
         y, pull = jax.vjp(lambda p, x: layer.apply({"params": p}, x, f), params, x)
         return y, pull(cotangent)
@@ -337,9 +336,9 @@ def test_noisy_dense_is_the_same_for_few_and_for_many_rows():
 def test_factorised_noise_by_definition():
     key = jax.random.key(2)
     e = np.asarray(jax.random.normal(key, (1000,)))
-    f = np.asarray(jit(layers.factorised_noise, static_argnums=1)(key, 1000))
+    f = np.asarray(jax.jit(layers.factorised_noise, static_argnums=1)(key, 1000))
     np.testing.assert_allclose(f, np.sign(e) * np.sqrt(np.abs(e)), rtol=1e-5)
-    assert jit(layers.factorised_noise, static_argnums=1)(key, 0).shape == (0,)
+    assert jax.jit(layers.factorised_noise, static_argnums=1)(key, 0).shape == (0,)
 
 
 def test_noisy_dense_noise_is_one_outer_product_in_the_size_of_its_sigmas():
@@ -354,7 +353,7 @@ def test_noisy_dense_noise_is_one_outer_product_in_the_size_of_its_sigmas():
     probe = np.concatenate([np.zeros((1, inputs)), np.eye(inputs)]).astype(np.float32)
     e = np.random.default_rng(0).normal(size=inputs + outputs).astype(np.float32)
     f = np.sign(e) * np.sqrt(np.abs(e))
-    y = np.asarray(jit(layer.apply)({"params": params}, probe, f), np.float64)
+    y = np.asarray(jax.jit(layer.apply)({"params": params}, probe, f), np.float64)
     np.testing.assert_allclose((y[0] - params["bias"]) / sigma, f[inputs:], atol=1e-4)
     noise = (y[1:] - y[0] - params["kernel"]) / sigma
     np.testing.assert_allclose(noise, np.outer(f[:inputs], f[inputs:]), atol=1e-4)

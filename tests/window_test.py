@@ -1,9 +1,10 @@
 """srl_jax/window.py: which frames make up an observation, and in which order."""
 
+import jax
 import numpy as np
 
 from srl_jax.window import image, observation, only, stack_last
-from tests.helpers import STACK, jit, make_window
+from tests.helpers import STACK, make_window
 
 
 def numbered(batch=2, horizon=3):
@@ -30,14 +31,14 @@ def test_observation_at_an_offset_by_hand():
 
 
 def test_observation_at_an_offset_of_its_own_for_each_row():
-    seen = jit(observation)(numbered(), np.array([3, 1], np.int32))
+    seen = jax.jit(observation)(numbered(), np.array([3, 1], np.int32))
     np.testing.assert_array_equal(seen[:, 0, 0], [[3, 4, 5, 6], [11, 12, 13, 14]])
 
 
 def test_traced_and_whole_offsets_agree():
     window = make_window(1, size=5)
     for k in range(4):
-        traced = jit(observation)(window, np.full(4, k, np.int32))
+        traced = jax.jit(observation)(window, np.full(4, k, np.int32))
         np.testing.assert_array_equal(traced, observation(window, k))
 
 
@@ -65,4 +66,4 @@ def test_colour_of_any_shape_stays_together():
     assert seen.shape == (2, 3, 5, 3 * STACK)
     expected = [101, 111, 121, 102, 112, 122, 103, 113, 123, 104, 114, 124]
     np.testing.assert_array_equal(seen[1, 2, 4], expected)
-    np.testing.assert_array_equal(jit(observation)(window, np.array([0, 1]))[1], seen[1])
+    np.testing.assert_array_equal(jax.jit(observation)(window, np.array([0, 1]))[1], seen[1])

@@ -23,7 +23,7 @@ from srl_jax.learning.optim import RL
 from srl_jax.learning.update import Hyper
 from srl_jax.replay import Replay
 from srl_jax.types import Objective, TrainState
-from tests.helpers import SMALL, jit, make_encoder, make_window, random_params
+from tests.helpers import SMALL, make_encoder, make_window, random_params
 
 
 def keep(path, parts, config, step):
@@ -97,7 +97,7 @@ def test_gradient_conflict_of_losses_whose_gradients_are_known():
     hyper = Hyper({RL: np.float32(1), "same": np.float32(4), "against": np.float32(1)}, {})
     # In mode decoupled RL's gradient does not enter the encoder; this is the one that it would be.
     for mode in ("joint", "decoupled"):
-        conflict = jit(make_conflict(encoder, terms, MODES[mode]))
+        conflict = jax.jit(make_conflict(encoder, terms, MODES[mode]))
         found = {
             name: [float(x) for x in pair] for name, pair in conflict(state, make_window(), hyper).items()
         }

@@ -14,7 +14,7 @@ from srl_jax.encoders.impala import doubled, halved
 from srl_jax.encoders.options import ENDS, End, Latent
 from srl_jax.layers import Conv, ConvTranspose, padding_of, sim_norm
 from srl_jax.window import to_unit
-from tests.helpers import STACK, count, identical, jit, random_params
+from tests.helpers import STACK, count, identical, random_params
 
 
 @pytest.mark.parametrize(
@@ -116,7 +116,7 @@ def test_extra_inputs_reach_every_image(name):
     decoder = encoder.make_decoder(2)
     z = np.random.default_rng(0).normal(size=encoder.features).astype(np.float32)
     inputs = np.concatenate([np.stack([z, z]), np.eye(2, dtype=np.float32)], 1)
-    first, second = np.asarray(jit(decoder.apply)(random_params(decoder.init), inputs))
+    first, second = np.asarray(jax.jit(decoder.apply)(random_params(decoder.init), inputs))
     assert (first != second).any(-1).mean() > 0.9
     if name == "nature":  # ends in a sigmoid
         assert first.min() > 0 and first.max() < 1
@@ -130,7 +130,7 @@ def test_pixels_are_divided_by_255():
     image = np.random.default_rng(0).integers(0, 256, (3, 18, 18, STACK), dtype=np.uint8)
     params = random_params(encoder.init)
     from_bytes, from_unit = (
-        jit(encoder.apply)(params, x) for x in (image, image.astype(np.float32) / np.float32(255))
+        jax.jit(encoder.apply)(params, x) for x in (image, image.astype(np.float32) / np.float32(255))
     )
     np.testing.assert_allclose(from_bytes, from_unit, rtol=1e-6, atol=1e-6)
 
@@ -146,7 +146,7 @@ def test_latents_can_start_blind_to_a_uniform_background_and_see_a_ball():
         frame[y : y + 4, x : x + 2] = 236
     for options, started in (({"init": "he", "zero_sum": True, "gain": 32.0}, True), ({}, False)):
         encoder = encoders.nature((84, 84, STACK), **options)
-        z = np.asarray(jit(lambda key, x, e=encoder: e.apply(e.init(key), x))(jax.random.key(0), frames))
+        z = np.asarray(jax.jit(lambda key, x, e=encoder: e.apply(e.init(key), x))(jax.random.key(0), frames))
         assert np.allclose(z[:2], 0, atol=1e-4) == started
         assert (0.05 < z[2:].std(0).mean() < 2) == started
         on = (z[2:] > 0).mean(0)
@@ -257,7 +257,7 @@ def test_bottleneck_is_normalised_before_its_tanh(layer_norm):
     image = np.random.default_rng(0).integers(0, 256, (2, 17, 17, STACK), dtype=np.uint8)
     params = random_params(encoder.init)
     params = {name: {**layer, "bias": 0 * layer["bias"]} for name, layer in params.items()}
-    z = jit(encoder.apply)(params, image)
+    z = jax.jit(encoder.apply)(params, image)
     before = np.arctanh(np.asarray(z, np.float64))
     normal = np.allclose(before.mean(1), 0, atol=1e-4) and np.allclose(before.std(1), 1, atol=1e-2)
     assert normal == layer_norm
@@ -307,7 +307,7 @@ def test_every_pixel_of_an_odd_image_counts(name):
     encoder = encoders.REGISTRY[name](shape)
     params = random_params(encoder.init)
     images = np.random.default_rng(0).uniform(size=(2, *shape)).astype(np.float32)
-    gradient = np.asarray(jit(jax.grad(lambda x: jnp.sum(encoder.apply(params, x) ** 2)))(images))
+    gradient = np.asarray(jax.jit(jax.grad(lambda x: jnp.sum(encoder.apply(params, x) ** 2)))(images))
     assert (gradient != 0).any((0, 3)).all()
 
 

@@ -16,7 +16,7 @@ from srl_jax.learning.optim import make_optimizer
 from srl_jax.learning.update import make_init, passes
 from srl_jax.types import Context, Encoder
 from tests import helpers
-from tests.helpers import NUM_ACTIONS, SIZE, STACK, draw, jit, make_window
+from tests.helpers import NUM_ACTIONS, SIZE, STACK, draw, make_window
 
 MIXING = Mixing(1.0, 0.75)
 
@@ -121,13 +121,15 @@ def test_one_objectives_noise_does_not_depend_on_what_others_ask_for():
         losses, _ = losses_of(params, state, window)
         return sum(map(jnp.mean, losses.values())), losses
 
-    (_, together), gradient = jit(lambda p: jax.value_and_grad(total, has_aux=True)(p, terms))(state.params)
+    (_, together), gradient = jax.jit(lambda p: jax.value_and_grad(total, has_aux=True)(p, terms))(
+        state.params
+    )
     for name in terms:
-        _, alone = jit(lambda p, name=name: total(p, [name]))(state.params)
+        _, alone = jax.jit(lambda p, name=name: total(p, [name]))(state.params)
         np.testing.assert_allclose(alone[name], together[name], rtol=1e-5)
     assert gradient["encoder"][RADIUS] != 0
     state = state._replace(step=np.int32(1))
-    _, later = jit(lambda p: total(p, ["latent_l2"]))(state.params)
+    _, later = jax.jit(lambda p: total(p, ["latent_l2"]))(state.params)
     assert not np.allclose(later["latent_l2"], together["latent_l2"])
 
 

@@ -2,6 +2,7 @@
 
 import hashlib
 
+import jax
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -11,7 +12,7 @@ from srl_jax import encoders, envs
 from srl_jax.envs import catch
 from srl_jax.envs.games import BACKGROUNDS
 from tests.envs.players import same
-from tests.helpers import jit, random_params
+from tests.helpers import random_params
 
 LEFT, NOOP, RIGHT = range(3)
 BOTH = pytest.mark.parametrize("game", ["Catch", "CatchDistractor"])
@@ -97,7 +98,7 @@ def test_every_encoder_sees_the_paddle(name, size):
         return
     env = envs.make("Catch", num_envs=1, seed=0, frame_size=size)
     encoder = encoders.REGISTRY[name]((size, size, 4))
-    params, apply = random_params(encoder.init), jit(encoder.apply)
+    params, apply = random_params(encoder.init), jax.jit(encoder.apply)
     latents = []
     for paddle in (30, 40):
         put(env, ball_x=50, ball_y=20, drift=0, fall=3, paddle=paddle)

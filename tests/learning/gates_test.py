@@ -13,7 +13,7 @@ from srl_jax.learning.modes import GATES, MODES, PROJECTING
 from srl_jax.learning.optim import PROJECTIONS, RL, make_optimizer
 from srl_jax.learning.update import Hyper, make_init, make_update, passes
 from srl_jax.types import Objective
-from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_encoder, make_window, random_state
+from tests.helpers import NUM_ACTIONS, all_moved, identical, make_encoder, make_window, random_state
 from tests.learning.modes_test import FRAME, TERMS, WINDOW, small
 
 
@@ -83,7 +83,7 @@ def one_update(gate, form, active=tuple(LOSSES)):
     plan = passes(mode, terms, form)
     state = random_state(make_init(ENCODER, terms, mode, optimizer, plan=plan))
     rates = dict.fromkeys(("encoder", "encoder_srl", RL, "representation"), np.float32(0.01))
-    update = jit(make_update(ENCODER, terms, mode, optimizer, plan=plan, gate=gate))
+    update = jax.jit(make_update(ENCODER, terms, mode, optimizer, plan=plan, gate=gate))
     after, _, metrics = update(state, make_window(), Hyper({n: NUMBERS[n] for n in active}, rates))
     return state, after, metrics
 
@@ -142,7 +142,7 @@ def test_two_steps_one_after_the_other_have_no_projection():
 def stepped(gate, form="summed", mode="joint"):
     """(agent, its update, before, after one update) of a small real configuration."""
     agent = make_agent(small(mode, gate=gate, encoder_optimizer=form), (FRAME, FRAME, 1), NUM_ACTIONS)
-    state, update = random_state(agent.init), jit(agent.update.pure)
+    state, update = random_state(agent.init), jax.jit(agent.update.pure)
     return agent, update, state, update(state, WINDOW, agent.hyper)[0]
 
 

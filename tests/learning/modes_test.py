@@ -16,7 +16,7 @@ from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, make_optimizer
 from srl_jax.learning.update import ema, make_init, make_update, periodic
 from srl_jax.types import Context, Objective
-from tests.helpers import NUM_ACTIONS, all_moved, identical, jit, make_window, random_state
+from tests.helpers import NUM_ACTIONS, all_moved, identical, make_window, random_state
 
 TERMS = ("reconstruction", "inverse")
 MOVES = {  # in two updates; all other groups of the mode stay bit-identical
@@ -50,7 +50,7 @@ def small(mode, **values):
 def build(mode):
     """(agent, its update compiled quickly, an initial state on the host) of a small configuration."""
     agent = make_agent(small(mode), (FRAME, FRAME, 1), NUM_ACTIONS)
-    return agent, jit(agent.update.pure), random_state(agent.init)
+    return agent, jax.jit(agent.update.pure), random_state(agent.init)
 
 
 @functools.cache
@@ -61,7 +61,7 @@ def two_updates(mode):
     second, _, _ = update(first, WINDOW, agent.hyper)
     assert agent.follow_every == (2 if agent.mode.rl else 0)
     if agent.follow_every:  # the loop's part
-        second = jit(agent.follow.__wrapped__)(second)
+        second = jax.jit(agent.follow.__wrapped__)(second)
     return state, first, second, metrics
 
 
@@ -233,7 +233,7 @@ def two_updates_by_rules(mode):
     terms = {name: objective._replace(slow=rules[name]) for name, objective in terms.items()}
     optimizer = make_optimizer(terms)
     state = random_state(make_init(agent.encoder, terms, MODES[mode], optimizer))
-    update = jit(make_update(agent.encoder, terms, MODES[mode], optimizer))
+    update = jax.jit(make_update(agent.encoder, terms, MODES[mode], optimizer))
     hyper = agent.hyper._replace(weights=dict.fromkeys(terms, np.float32(1)))
     window = make_window(horizon=max(term.horizon for term in terms.values()) or 1, size=FRAME)
     states = [state]
@@ -291,7 +291,7 @@ def test_a_self_predictive_objective_has_a_slow_encoder_that_moves(mode, monkeyp
     monkeypatch.setitem(objectives.REGISTRY, "spr", spr)
     agent = make_agent(dataclasses.replace(small(mode), objectives=("spr",)), (FRAME, FRAME, 1), NUM_ACTIONS)
     assert agent.horizon == 5 and agent.follow_every == 1
-    update, follow = jit(agent.update.pure), jit(agent.follow.__wrapped__)
+    update, follow = jax.jit(agent.update.pure), jax.jit(agent.follow.__wrapped__)
     window = make_window(size=FRAME, horizon=5)
     start = state = random_state(agent.init)
     slow = start.slow["spr"]

@@ -9,7 +9,7 @@ import pytest
 
 from srl_jax.learning.optim import NOT_MEASURED, make_optimizer, real_copy
 from srl_jax.types import Objective
-from tests.helpers import identical, jit, to_numpy
+from tests.helpers import identical, to_numpy
 
 RATES = {"encoder": 0.1, "rl": 0.01, "reconstruction": 0.001, "inverse": 0.001}
 HEADS = {"rl": False, "reconstruction": True, "inverse": False}  # whether it is a decoder
@@ -47,7 +47,7 @@ def torch_adam(params, grads, *, eps=1e-8, decay=0.0, clip=0.0):
 def ours(params, grads, **options):
     names = {"decay": "decoder_weight_decay", "clip": "max_grad_norm", "eps": "adam_eps"}
     optimizer = make_optimizer(OBJECTIVES, **{names[n]: value for n, value in options.items()})
-    state, norms, update = optimizer.init(params), [], jit(optimizer.update)
+    state, norms, update = optimizer.init(params), [], jax.jit(optimizer.update)
     for i, gradient in enumerate(grads):
         params, state, norm = update(gradient, state, params, RATES, i != 1)
         norms.append(norm)
@@ -94,7 +94,7 @@ def test_decay_changes_decoders_alone_and_by_hand():
 def test_groups_that_are_left_out_keep_their_moments_and_their_count():
     # Three steps of two groups, of which the head misses the second, equal two steps of the head alone.
     optimizer = make_optimizer(OBJECTIVES)
-    update = jit(optimizer.update)
+    update = jax.jit(optimizer.update)
     params, grads = tree(0), [tree(1), tree(2), tree(3)]
     without = lambda t: {n: h for n, h in t.items() if n != "inverse"}  # noqa: E731
     state, some = optimizer.init(params), params
@@ -114,7 +114,7 @@ def test_groups_that_are_left_out_keep_their_moments_and_their_count():
 def test_rates_are_traced():
     optimizer = make_optimizer(OBJECTIVES)
     params, grads = tree(0), tree(1)
-    update = jit(optimizer.update)
+    update = jax.jit(optimizer.update)
     state = optimizer.init(params)
     still, _, _ = update(grads, state, params, dict.fromkeys(RATES, 0.0))
     moved, _, _ = update(grads, state, params, dict.fromkeys(RATES, 0.1))
@@ -138,7 +138,7 @@ def test_decoupled_decay_is_optax_adamws_but_for_what_has_one_axis():
     ours = make_optimizer({}, weight_decay=0.3)
     theirs = optax.adamw(0.01, weight_decay=0.3, mask=lambda tree: jax.tree.map(lambda x: x.ndim != 1, tree))
     moved, expected = {"rl": params}, params
-    state, their_state, update = ours.init(moved), theirs.init(expected), jit(ours.update)
+    state, their_state, update = ours.init(moved), theirs.init(expected), jax.jit(ours.update)
     for gradient in gradients:
         moved, state, _ = update({"rl": gradient}, state, moved, {"rl": 0.01})
         steps, their_state = theirs.update(gradient, their_state, expected)

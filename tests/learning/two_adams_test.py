@@ -16,7 +16,6 @@ from srl_jax.learning.modes import ENCODER_OPTIMIZERS, MODES
 from srl_jax.learning.optim import NOT_MEASURED, RL, make_optimizer
 from srl_jax.learning.update import NORM_EVERY, Hyper, make_init, make_update, passes, periodic
 from srl_jax.types import Encoder, Objective, Window
-from tests.helpers import jit
 
 EXPECTED = Path(__file__).with_suffix(".json").with_name("two_adams.json")
 INPUTS, FEATURES, ACTIONS, BATCH, UPDATES = 6, 4, 2, 5, 10
@@ -126,7 +125,7 @@ def test_ten_updates_are_pytorchs(form, clip):
     plan = passes(MODES["joint"], terms, form)
     init = make_init(encoder, terms, MODES["joint"], optimizer, plan=plan)
     state = init(jax.random.key(0), {**start(), "l2": {}})
-    update = jit(make_update(encoder, terms, MODES["joint"], optimizer, plan=plan))
+    update = jax.jit(make_update(encoder, terms, MODES["joint"], optimizer, plan=plan))
     hyper = Hyper({name: np.float32(term.weight) for name, term in terms.items()}, RATES)
     for i, batch in enumerate(batches()):
         before = state.params["encoder"]
@@ -147,7 +146,7 @@ def test_the_ratio_of_the_two_steps_does_not_see_a_losss_weight():
     encoder, terms = network()
     optimizer = make_optimizer(terms)
     init = make_init(encoder, terms, MODES["joint"], optimizer)
-    update = jit(make_update(encoder, terms, MODES["joint"], optimizer))
+    update = jax.jit(make_update(encoder, terms, MODES["joint"], optimizer))
     for weight in (1.0, 1000.0):
         hyper = Hyper({RL: 1.0, "decoder": weight, "l2": 0.0}, RATES)
         state = init(jax.random.key(0), {**start(), "l2": {}})

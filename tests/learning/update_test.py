@@ -22,7 +22,7 @@ from srl_jax.learning.update import (
 )
 from srl_jax.types import Encoder, Objective
 from srl_jax.window import observation
-from tests.helpers import all_moved, identical, jit, make_window, to_numpy
+from tests.helpers import all_moved, identical, make_window, to_numpy
 
 
 def make_peek(weight=1.0, **options):
@@ -74,7 +74,7 @@ def test_another_objective_changes_no_ones_noise_or_start():
     assert not np.array_equal(heads["first"]["w"], heads["peek"]["w"])
 
     ours, theirs = (
-        jit(update)(state, SMALL, hyper)[2]
+        jax.jit(update)(state, SMALL, hyper)[2]
         for state, (_, update, hyper) in zip(states, (alone, together), strict=True)
     )
     np.testing.assert_array_equal(ours[f"{RL}/noise"], theirs[f"{RL}/noise"])
@@ -84,7 +84,7 @@ def test_another_objective_changes_no_ones_noise_or_start():
 
 def test_noise_differs_between_updates_and_seeds():
     init, update, hyper = make_peeks(RL)
-    update = jit(update)
+    update = jax.jit(update)
     noises = []
     for seed in (0, 1):
         state = init(jax.random.key(seed))
@@ -101,7 +101,7 @@ def test_an_update_of_some_objectives_leaves_the_others_alone():
     init = make_init(PIXELS, terms, MODES["joint"], optimizer, plan=plans[tuple(terms)])
     hyper = Hyper(dict.fromkeys(terms, np.float32(1)), RATES)
     update = {
-        names: jit(make_update(PIXELS, terms, MODES["joint"], optimizer, plan=plan))
+        names: jax.jit(make_update(PIXELS, terms, MODES["joint"], optimizer, plan=plan))
         for names, plan in plans.items()
     }
     start = init(jax.random.key(0))
@@ -117,7 +117,7 @@ def test_an_update_of_some_objectives_leaves_the_others_alone():
     assert not identical(one.opt_state["encoder"], both.opt_state["encoder"])
     # In decoupled, the encoder is trained by what is left out, and so rests; Adam counts no step for it.
     plan = passes(MODES["decoupled"], (RL,))
-    rests = jit(make_update(PIXELS, terms, MODES["decoupled"], optimizer, plan=plan))
+    rests = jax.jit(make_update(PIXELS, terms, MODES["decoupled"], optimizer, plan=plan))
     after, _, _ = rests(start, SMALL, hyper)
     assert identical(after.params["encoder"], start.params["encoder"])
     assert identical(after.opt_state["encoder"], start.opt_state["encoder"])
@@ -138,10 +138,10 @@ def test_slow_copies_may_follow_apart_from_the_update():
         optimizer, hyper = make_optimizer(terms), Hyper(dict.fromkeys(terms, np.float32(1)), RATES)
         state = make_init(PIXELS, terms, MODES["joint"], optimizer)(jax.random.key(0))
         within, apart = (
-            jit(make_update(PIXELS, terms, MODES["joint"], optimizer, slow_follows=follows))
+            jax.jit(make_update(PIXELS, terms, MODES["joint"], optimizer, slow_follows=follows))
             for follows in (True, False)
         )
-        follow, ours, theirs = jit(make_follow(terms)), state, state
+        follow, ours, theirs = jax.jit(make_follow(terms)), state, state
         for i in range(1, 5):
             ours, *_ = within(ours, SMALL, hyper)
             theirs, *_ = apart(theirs, SMALL, hyper)
@@ -153,7 +153,7 @@ def test_slow_copies_may_follow_apart_from_the_update():
 @pytest.mark.parametrize("target_encoder", ["slow", "online"])
 def test_target_encoder(target_encoder):
     init, update, hyper = make_peeks(RL, every=3, target_encoder=target_encoder)
-    update, state = jit(update), init(jax.random.key(0))
+    update, state = jax.jit(update), init(jax.random.key(0))
     assert (state.slow[RL]["encoder"] == {}) == (target_encoder == "online")
     start = state.params["encoder"]["scale"]
     pixels = observation(SMALL, 0).reshape(len(SMALL.frames), -1) / 255
@@ -177,7 +177,7 @@ def test_no_gradient_through_the_target_encoder():
         optimizer = make_optimizer(terms)
         state = make_init(PIXELS, terms, MODES["joint"], optimizer, **options)(jax.random.key(0))
         update = make_update(PIXELS, terms, MODES["joint"], optimizer)
-        after, _, _ = jit(update)(state, SMALL, Hyper({RL: 1.0}, RATES))
+        after, _, _ = jax.jit(update)(state, SMALL, Hyper({RL: 1.0}, RATES))
         assert identical(state.params["encoder"], after.params["encoder"])
         assert not identical(state.params[RL], after.params[RL])
 
@@ -187,7 +187,7 @@ def test_an_objective_may_have_a_slow_copy_of_its_own_rule():
     optimizer = make_optimizer(terms)
     before = make_init(PIXELS, terms, MODES["joint"], optimizer)(jax.random.key(0))
     update = make_update(PIXELS, terms, MODES["joint"], optimizer)
-    after, _, _ = jit(update)(before, SMALL, Hyper({RL: 1.0, "peek": 1.0}, RATES))
+    after, _, _ = jax.jit(update)(before, SMALL, Hyper({RL: 1.0, "peek": 1.0}, RATES))
     expected = 0.5 * after.params["peek"]["w"] + 0.5 * before.slow["peek"]["head"]["w"]
     np.testing.assert_allclose(after.slow["peek"]["head"]["w"], expected, rtol=1e-6)
     assert identical(after.slow[RL], before.slow[RL])
@@ -248,8 +248,8 @@ def test_seeds_may_be_vmapped_from_the_start():
     init, update, hyper = make_peeks(RL, "peek")
     keys = jax.random.split(jax.random.key(0), 2)
     both = jax.vmap(init)(keys)
-    both, _, metrics = jit(jax.vmap(update, (0, None, None)))(both, SMALL, hyper)
-    update = jit(update)
+    both, _, metrics = jax.jit(jax.vmap(update, (0, None, None)))(both, SMALL, hyper)
+    update = jax.jit(update)
     for i in range(2):
         single, _, single_metrics = update(init(keys[i]), SMALL, hyper)
         ours = to_numpy(jax.tree.map(lambda x, i=i: x[i], both.params))
@@ -281,7 +281,7 @@ def test_a_gate_that_is_shut_costs_no_differentiation():
     # In frozen, the encoder's gradient is not merely zero: it is not asked for.
     init, update, hyper = make_peeks(RL, mode="frozen", clip=1e9)
     state = init(jax.random.key(0))
-    after, _, metrics = jit(update)(state, SMALL, hyper)
+    after, _, metrics = jax.jit(update)(state, SMALL, hyper)
     assert identical(after.params["encoder"], state.params["encoder"])
     gradient = 2 * np.asarray(state.params[RL]["w"])  # of the head's sum of squares
     np.testing.assert_allclose(metrics["grad_norm/all"], np.linalg.norm(gradient), rtol=1e-5)
@@ -305,7 +305,7 @@ def run_act(noisy, step, epsilon, key=0):
     return np.asarray(act({"scale": 1.0}, head, FRAMES, jax.random.key(key), step, np.float32(epsilon)))
 
 
-_acts = {noisy: jit(make_act(PIXELS, q_values, noisy=noisy)) for noisy in (False, True)}
+_acts = {noisy: jax.jit(make_act(PIXELS, q_values, noisy=noisy)) for noisy in (False, True)}
 # The latent's first four numbers are the four frames' first pixels, newest last.
 GREEDY = FRAMES[:, :, 0, 0, 0].argmax(1)
 

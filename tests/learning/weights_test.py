@@ -3,7 +3,6 @@
 import dataclasses
 import functools
 from functools import partial
-from unittest import mock
 
 import jax
 import numpy as np
@@ -24,7 +23,7 @@ from srl_jax.run import loop, saving
 from srl_jax.run.schedules import Schedules
 from srl_jax.specs import Weight, parse_weight
 from srl_jax.types import Objective
-from tests.helpers import SMALL, jit, make_context, make_encoder, make_window, random_state
+from tests.helpers import SMALL, make_context, make_encoder, make_window, random_state
 
 
 @pytest.mark.parametrize(
@@ -114,8 +113,8 @@ def run_of(form, updates=60):
     hyper = Hyper(
         {n: np.float32(x.weight) for n, x in LOSSES.items()}, {n: np.float32(x) for n, x in rates.items()}
     )
-    update = jit(make_update(ENCODER, LOSSES, mode, optimizer, plan=plan))
-    norms = jit(make_norms(ENCODER, LOSSES, mode, optimizer))
+    update = jax.jit(make_update(ENCODER, LOSSES, mode, optimizer, plan=plan))
+    norms = jax.jit(make_norms(ENCODER, LOSSES, mode, optimizer))
     found, window = [], make_window()
     for i in range(updates):
         if i % NORM_EVERY == 0:
@@ -191,8 +190,7 @@ def used(path):
 def alone(tmp_path_factory):
     """(agent, directory of a whole run)."""
     path = tmp_path_factory.mktemp("alone")
-    with mock.patch.object(jax, "jit", jit):  # compiles faster
-        agent = make_agent(RUN, (42, 42, 1), 3)
+    agent = make_agent(RUN, (42, 42, 1), 3)
     loop.train(RUN, path, progress=False, agent=agent)
     return agent, path
 
@@ -222,8 +220,7 @@ def test_a_seed_with_a_ratio_in_company_is_the_seed_alone(alone, tmp_path):
     paths = [tmp_path / name for name in ("s0", "s7")]
     for path in paths:
         path.mkdir()
-    with mock.patch.object(jax, "jit", jit):
-        loop.train_seeds(RUN, [0, 7], paths, progress=False)
+    loop.train_seeds(RUN, [0, 7], paths, progress=False)
     together, other = map(used, paths)
     assert together == pytest.approx(used(alone[1]), rel=1e-3)
     assert together != pytest.approx(other, rel=1e-3)

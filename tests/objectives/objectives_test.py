@@ -23,7 +23,7 @@ from srl_jax.objectives.reconstruction import mean_squared_error
 from srl_jax.types import Context, Latents, Objective, TrainState, Window
 from srl_jax.window import image
 from tests import helpers
-from tests.helpers import SIZE, STACK, jit, make_context, make_encoder, make_window
+from tests.helpers import SIZE, STACK, make_context, make_encoder, make_window
 
 BATCH = 4
 
@@ -180,11 +180,11 @@ def build(kind: str, name: str) -> Row:
         init=init,
         window=make_window(batch=BATCH, horizon=max(1, objective.horizon)),
         key=jax.random.key(7),
-        probe=jit(probe),
-        shut_gradient=jit(shut_gradient),
-        picture=jit(picture),
-        update=jit(update),
-        vmapped=jit(jax.vmap(update, (0, None, None))),
+        probe=jax.jit(probe),
+        shut_gradient=jax.jit(shut_gradient),
+        picture=jax.jit(picture),
+        update=jax.jit(update),
+        vmapped=jax.jit(jax.vmap(update, (0, None, None))),
     )
 
 

@@ -25,7 +25,6 @@ from tests import helpers
 from tests.helpers import (
     STACK,
     draw,
-    jit,
     latents_of,
     loss_of,
     make_context,
@@ -185,11 +184,11 @@ def rank_after_training(
     terms = {name: objectives.REGISTRY[name](Context.of(encoder, 3), **options)}
     optimizer = make_optimizer(terms)
     init = make_init(encoder, terms, MODES["pretrain"], optimizer)
-    state = jit(init)(jax.random.key(0))
-    update = jit(make_update(encoder, terms, MODES["pretrain"], optimizer))
+    state = jax.jit(init)(jax.random.key(0))
+    update = jax.jit(make_update(encoder, terms, MODES["pretrain"], optimizer))
     rates = {"encoder": 1e-3, "encoder_srl": 1e-3, "rl": 1e-3, "representation": 3e-2}
     hyper = Hyper({name: np.float32(1)}, {group: np.float32(rate) for group, rate in rates.items()})
-    encode = jit(encoder.apply)
+    encode = jax.jit(encoder.apply)
 
     def rank() -> float:
         z = np.asarray(encode(state.params["encoder"], image(window, 0)), np.float64)

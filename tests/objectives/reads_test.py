@@ -26,7 +26,6 @@ from tests.helpers import (
     STACK,
     all_zero,
     draw,
-    jit,
     latents_of,
     make_context,
     make_encoder,
@@ -72,7 +71,7 @@ def test_spr_by_the_first_layer_of_rl_against_numpy(target, options, layers):
     own = helpers.random_params(objective.init)
     assert sorted(own) == ["predictor", "transition"]
     head, behind = (objective.head(own, objective.read({RL: x})) for x in (of_rl, lagged))
-    losses, _ = jit(lambda *args: objective.loss(*args, latents_of(z, slow), window, None))(head, behind)
+    losses, _ = jax.jit(lambda *args: objective.loss(*args, latents_of(z, slow), window, None))(head, behind)
 
     def project(tree, x):
         return np.concatenate([linear(tree[name], x) for name in layers], -1)
@@ -105,7 +104,7 @@ def test_sprs_gradient_moves_rls_first_layer_alone_where_the_gate_is_open(mode, 
     optimizer, plan = make_optimizer(terms), passes(mode, terms, form)
     init = make_init(make_encoder(), terms, mode, optimizer, plan=plan)
     state = helpers.random_state(init)
-    update = jit(make_update(make_encoder(), terms, mode, optimizer, plan=plan))
+    update = jax.jit(make_update(make_encoder(), terms, mode, optimizer, plan=plan))
     hyper = Hyper({RL: np.float32(0), "spr": np.float32(1)}, RATES)  # RL's own gradient is 0
     new, _, _ = update(state, make_window(horizon=STEPS), hyper)
     changed = jax.tree.map(lambda a, b: bool(np.any(a != b)), new.params[RL], state.params[RL])
@@ -204,7 +203,7 @@ def test_a_tied_decoder_by_hand():
         mode = MODES["pretrain"]._replace(representation_trains_encoder=opens)
         losses_of = make_losses(encoder, terms, mode, views=UNCHANGED)
         loss = lambda params: jnp.mean(losses_of(params, state, window)[0]["reconstruction"])  # noqa: B023, E731
-        value, gradient = jit(jax.value_and_grad(loss))(state.params)
+        value, gradient = jax.jit(jax.value_and_grad(loss))(state.params)
         assert float(value) == pytest.approx(9)
         assert float(gradient["encoder"]["Conv_0"]["kernel"].sum()) == pytest.approx(slope)
 

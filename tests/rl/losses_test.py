@@ -21,7 +21,6 @@ from srl_jax.rl.losses import (
     quantile_q_learning,
     soft_policy,
 )
-from tests.helpers import jit
 
 # rlax's categorical losses call a function of its own that it means to drop one day.
 pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:PendingDeprecationWarning")
@@ -66,7 +65,7 @@ def test_q_learning_is_rlax_double_q_learning():
     floats = [x[n] for n in ("q_tm1", "r_t", "discount_t", "q_slow_t", "q_selector_t")]
     ours = lambda q, r, d, slow, sel, a: q_learning(q, a, r, d, slow, sel)  # noqa: E731
     theirs = lambda q, r, d, slow, sel, a: rlax.double_q_learning(q, a, r, d, slow, sel)  # noqa: E731
-    run = jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
+    run = jax.jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
     (ours, grads), (theirs, _) = run(floats, x["a_tm1"])
     close(ours, theirs)
     # td = target - q: the gradient of the mean square is -2 td / B at the action taken, and nothing else.
@@ -80,7 +79,7 @@ def test_q_learning_is_rlax_double_q_learning():
 def test_q_learning_with_the_slow_values_as_selector_is_rlax_q_learning():
     x = transitions(1)
 
-    @jit
+    @jax.jit
     def both(q, a, r, d, slow):
         return jax.vmap(q_learning)(q, a, r, d, slow, slow), jax.vmap(rlax.q_learning)(q, a, r, d, slow)
 
@@ -93,8 +92,8 @@ def test_q_learning_by_hand():
     # 0.5 + 0.9 * 10 - 2 = 7.5.
     q, slow = jnp.array([2.0, -1.0]), jnp.array([10.0, 4.0])
     arguments = (q, jnp.int32(0), jnp.float32(0.5), jnp.float32(0.9), slow)
-    assert float(jit(q_learning)(*arguments, jnp.array([1.0, 3.0]))) == pytest.approx(2.1)
-    assert float(jit(q_learning)(*arguments, slow)) == pytest.approx(7.5)
+    assert float(jax.jit(q_learning)(*arguments, jnp.array([1.0, 3.0]))) == pytest.approx(2.1)
+    assert float(jax.jit(q_learning)(*arguments, slow)) == pytest.approx(7.5)
 
 
 @pytest.mark.parametrize("delta", [0.5, 1.0, 2.0])
@@ -102,7 +101,7 @@ def test_huber_is_rlax_huber_loss(delta):
     x = np.concatenate([np.linspace(-4, 4, 97), [delta, -delta]]).astype(np.float32)
     weight = np.linspace(1, 2, len(x), dtype=np.float32)
 
-    @jit
+    @jax.jit
     def both(x):
         return [
             jax.value_and_grad(lambda x, f=f: jnp.sum(weight * f(x, delta)))(x) + (f(x, delta),)
@@ -115,13 +114,13 @@ def test_huber_is_rlax_huber_loss(delta):
 
 def test_huber_by_hand():
     # Within delta 0.5 x^2: 0.125; beyond it delta (|x| - delta / 2): 3 - 0.5 = 2.5 with delta 1.
-    np.testing.assert_allclose(jit(huber)(jnp.array([0.5, -3.0])), [0.125, 2.5])
+    np.testing.assert_allclose(jax.jit(huber)(jnp.array([0.5, -3.0])), [0.125, 2.5])
 
 
 def same_and_alone_in_the_first(ours, theirs, x):
     """Two losses and their gradients are the same, and a gradient flows into the first argument alone."""
     floats = [x[n] for n in ("q_logits_tm1", "r_t", "discount_t", "q_logits_slow_t", "q_selector_t")]
-    run = jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
+    run = jax.jit(lambda floats, a: [values_and_gradients(f, floats, a) for f in (ours, theirs)])
     (losses, grads), reference = run(floats, x["a_tm1"])
     close((losses, grads), reference)
     assert np.any(grads[0])
@@ -143,7 +142,7 @@ def test_categorical_q_learning_selecting_for_itself_is_rlax_categorical_q_learn
     x = transitions(1)
     atoms = jnp.asarray(x["atoms"])
 
-    @jit
+    @jax.jit
     def both(q, a, r, d, slow):
         selector = jax.nn.softmax(slow) @ atoms
         ours = jax.vmap(categorical_q_learning, (0, None, 0, 0, 0, 0, 0))(q, atoms, a, r, d, slow, selector)
@@ -162,7 +161,7 @@ def test_categorical_q_learning_by_hand():
     atoms = jnp.array([-1.0, 0.0, 1.0])
     logits = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, np.log(2)]], jnp.float32)
     slow, selector = jnp.zeros((2, 3)), jnp.zeros(2)
-    loss = jit(
+    loss = jax.jit(
         lambda a: categorical_q_learning(logits, atoms, a, jnp.float32(0.5), jnp.float32(0), slow, selector)
     )
     assert float(loss(0)) == pytest.approx(np.log(3), rel=1e-5)
@@ -188,7 +187,7 @@ def test_quantile_q_learning_by_hand():
     # A return of 0.5 is above the first and below the second, each at 1/4 of the Huber loss 0.125: 0.0625.
     # A return of 3 is above both: 1/4 * 2.5 + 3/4 * 1.5 = 1.75.
     quantiles, slow, selector = jnp.array([[0.0, 1.0]]), jnp.zeros((1, 2)), jnp.zeros(1)
-    loss = jit(lambda r: quantile_q_learning(quantiles, jnp.int32(0), r, jnp.float32(0), slow, selector))
+    loss = jax.jit(lambda r: quantile_q_learning(quantiles, jnp.int32(0), r, jnp.float32(0), slow, selector))
     assert float(loss(jnp.float32(0.5))) == pytest.approx(0.0625)
     assert float(loss(jnp.float32(3.0))) == pytest.approx(1.75)
     # The selector prefers action 1, of slow quantiles 2 and 4: the targets are 1 + 0.5 * 2 and 1 + 0.5 * 4.
@@ -224,7 +223,7 @@ def test_munchausen_by_hand_and_as_the_paper_writes_it():
         r_t = munchausen_return(r_t, discount_t, q_tm1, a_tm1, policy, alpha, tau, clip)
         return r_t + discount_t * policy @ q_slow_t
 
-    ours = jit(jax.vmap(target))(*(x[n] for n in ("q_tm1", "a_tm1", "r_t", "discount_t", "q_slow_t")))
+    ours = jax.jit(jax.vmap(target))(*(x[n] for n in ("q_tm1", "a_tm1", "r_t", "discount_t", "q_slow_t")))
     close(ours, expected)
 
 
@@ -233,10 +232,12 @@ def test_categorical_projection_by_hand():
     atoms = jnp.array([-1.0, 0.0, 1.0])
     support, probs = jnp.array([0.25, -0.5, 7.0]), jnp.array([0.4, 0.2, 0.4])
     # -1: 0.2 / 2;  0: 0.3 + 0.2 / 2;  1: 0.1 + 0.4.
-    np.testing.assert_allclose(jit(categorical_projection)(support, probs, atoms), [0.1, 0.4, 0.5], atol=1e-6)
+    np.testing.assert_allclose(
+        jax.jit(categorical_projection)(support, probs, atoms), [0.1, 0.4, 0.5], atol=1e-6
+    )
 
 
-_project = jit(lambda *x: (categorical_projection(*x), rlax.categorical_l2_project(*x)))
+_project = jax.jit(lambda *x: (categorical_projection(*x), rlax.categorical_l2_project(*x)))
 
 
 @given(
@@ -285,7 +286,7 @@ def slow_n_step(steps, truncated, n):
     return total, factor, n
 
 
-_n_step = [jit(partial(n_step, n=n)) for n in range(1, HORIZON + 1)]
+_n_step = [jax.jit(partial(n_step, n=n)) for n in range(1, HORIZON + 1)]
 
 
 @given(
@@ -305,7 +306,7 @@ def test_n_step_is_the_slow_one(steps, truncated, n):
         assert int(offset) == expected_offset
 
 
-_annealed_n_step = jit(n_step)
+_annealed_n_step = jax.jit(n_step)
 
 
 @given(
@@ -326,7 +327,7 @@ def test_n_step_by_hand():
     rewards = np.array([[1, 2, 4, 8], [1, 2, 4, 8], [1, 2, 0, 0]], np.float32)
     discounts = np.array([[0.5] * 4, [0.5, 0, 0.5, 0.5], [0.5, 0.5, 0, 0]], np.float32)
     valid = np.array([[1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 0, 0]], np.float32)
-    r_t, discount_t, offset = jit(partial(n_step, n=3))(rewards, discounts, valid)
+    r_t, discount_t, offset = jax.jit(partial(n_step, n=3))(rewards, discounts, valid)
     # Going on: 1 + 0.5 * 2 + 0.25 * 4 = 3, bootstrap from s_{t+3} with 0.125.
     # A lost life after the second step: 1 + 0.5 * 2 = 2, no bootstrap.
     # Truncated after the second step: 2 as well, but bootstrap from s_{t+2} with 0.25.
@@ -342,7 +343,7 @@ def test_n_step_one_early_by_hand():
     rewards = np.array([[1, 2, 4], [1, 2, 4], [1, 2, 0], [1, 2, 0]], np.float32)
     discounts = np.array([[0.5] * 3, [0.5, 0.5, 0], [0.5, 0, 0], [0.5, 0.5, 0]], np.float32)
     valid = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 0]], np.float32)
-    r_t, discount_t, offset = jit(partial(n_step_one_early, n=3))(rewards, discounts, valid)
+    r_t, discount_t, offset = jax.jit(partial(n_step_one_early, n=3))(rewards, discounts, valid)
     np.testing.assert_array_equal(r_t, [3, 3, 2, 2])
     np.testing.assert_array_equal(discount_t, [0.125, 0.125, 0, 0.25])
     np.testing.assert_array_equal(offset[np.array([0, 1, 3])], [2, 2, 1])

@@ -16,7 +16,7 @@ from srl_jax.learning.update import periodic
 from srl_jax.rl import values
 from srl_jax.rl.losses import n_step
 from srl_jax.types import Context, Latents, TrainState, Window
-from tests.helpers import jit, random_params
+from tests.helpers import random_params
 from tests.rl.rl_test import (
     ACTIONS,
     ATOMS,
@@ -76,7 +76,7 @@ def test_the_whole_target_of_a_three_step_episode_by_hand():
         algorithm = rl.q_learner(Context(1, 2), values.scalar(), hidden=1, n_step=n, **options)
         return algorithm.objective.loss(head, slow_head, latents, window, jax.random.key(0))[1]["td_error"]
 
-    found, early = jit(
+    found, early = jax.jit(
         lambda: ([targets(n) for n in range(1, 5)], [targets(n, target="s_t+n-1") for n in (2, 3)])
     )()
     np.testing.assert_allclose(np.transpose(found), [expected for _, expected in EPISODE])
@@ -98,7 +98,7 @@ def test_iqn_is_rlax_at_the_taus_that_were_drawn(double, dueling):
     online, slow, window = make_case()
     key = jax.random.key(3)
 
-    @jit
+    @jax.jit
     def run(head, slow_head, key):
         latents = make_latents(online, slow)
         losses, metrics = algorithm.objective.loss(head, slow_head, latents, window, key)
@@ -171,7 +171,7 @@ def test_munchausen_is_the_paper_for_every_kind(kind):
     )  # fmt: skip
     head, slow_head = (random_params(algorithm.objective.init, seed) for seed in (1, 2))
     online, slow, window = make_case()
-    losses, metrics = jit(
+    losses, metrics = jax.jit(
         lambda *arrays: algorithm.objective.loss(*arrays[:2], make_latents(*arrays[2:]), window, None)
     )(head, slow_head, online, slow)
 
@@ -201,7 +201,7 @@ def test_drq_averages_targets_over_one_set_of_views_and_losses_over_another(kind
     *_, window = make_case()
     views = [make_case(seed)[:2] for seed in range(5)]  # as they are asked for: 3 of the target, then 2
 
-    @jit
+    @jax.jit
     def run(head, slow_head):
         left = iter(views)
         nothing = make_latents(np.full_like(views[0][0], np.nan), np.full_like(views[0][1], np.nan))
@@ -243,7 +243,7 @@ def test_streams_with_one_hidden_layer():
         ("q_hidden", "v_hidden"), head["hidden"]
     )
     expected = network(twice, z, True, np.concatenate([first, q, first, v]))[..., 0]
-    np.testing.assert_allclose(jit(algorithm.q_values)(head, z, key), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(algorithm.q_values)(head, z, key), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_a_slow_network_is_replaced_or_moved_or_there_is_none():
@@ -258,7 +258,7 @@ def test_a_slow_network_is_replaced_or_moved_or_there_is_none():
     online, _, window = make_case()
     replaced = row(hidden=8).objective.loss
 
-    @jit
+    @jax.jit
     def gradients(head, other):
         def mean(head, loss, slow_head):
             return loss(head, slow_head, make_latents(online, online), window, None)[0].mean()
@@ -281,7 +281,7 @@ def test_one_priority_a_batch_is_its_mean():
     head = random_params(rl.q_learner(CONTEXT, kinds[0], hidden=8).objective.init)
     online, slow, window = make_case()
     loss = [rl.q_learner(CONTEXT, kind, hidden=8).objective.loss for kind in kinds]
-    each, one = jit(lambda: [f(head, head, make_latents(online, slow), window, None) for f in loss])()
+    each, one = jax.jit(lambda: [f(head, head, make_latents(online, slow), window, None) for f in loss])()
     np.testing.assert_array_equal(each[0], one[0])
     assert one[1]["td_error"].shape == (1,)
     np.testing.assert_allclose(one[1]["td_error"], each[1]["td_error"].mean(), rtol=1e-6)

@@ -13,7 +13,7 @@ import rlax
 from srl_jax import rl, specs
 from srl_jax.rl import heads, values
 from srl_jax.types import Context, Latents, Window
-from tests.helpers import all_zero, count, identical, jit, random_params
+from tests.helpers import all_zero, count, identical, random_params
 
 pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:PendingDeprecationWarning")
 
@@ -101,7 +101,7 @@ def test_loss_is_rlax_on_the_n_step_view(kind, double, dueling, n_step):
     head, slow_head = (random_params(objective.init, seed) for seed in (1, 2))
     online, slow, window = make_case()
 
-    @jit
+    @jax.jit
     def run(head, slow_head, online, slow, key):
         latents = make_latents(online, slow)
         return (
@@ -172,7 +172,7 @@ def test_gradient_flows_through_the_sampled_state_alone(row, options):
         losses, _ = algorithm.objective.loss(head, slow_head, latents, window, jax.random.key(0))
         return jnp.mean(losses)
 
-    of_online, *of_slow = jit(jax.grad(mean, (0, 1, 2)))(online, slow, slow_head)
+    of_online, *of_slow = jax.jit(jax.grad(mean, (0, 1, 2)))(online, slow, slow_head)
     assert np.all(np.any(of_online[0], -1))  # every row's s_t
     assert all_zero(of_online[1:])
     assert all_zero(of_slow)
@@ -187,7 +187,7 @@ def test_noise_needs_a_key_and_differs_between_the_networks():
     still = np.broadcast_to(online[:1], online.shape)
     ones = np.ones_like(window.rewards)
 
-    @jit
+    @jax.jit
     def run(head, key):
         q = algorithm.q_values(head, still[0])
         noisy = algorithm.q_values(head, still[0], key)
@@ -217,7 +217,7 @@ def test_every_layer_has_noise_of_its_own_cut_from_one_draw(dueling):
     lengths = [FEATURES + 8, 8 + ACTIONS] + ([FEATURES + 8, 8 + 1] if dueling else [])
     noise = np.asarray(jax.random.normal(key, (sum(lengths),)))
     expected = network(head, z, dueling, np.asarray(noise))[..., 0]
-    np.testing.assert_allclose(jit(algorithm.q_values)(head, z, key), expected, rtol=1e-4, atol=1e-5)
+    np.testing.assert_allclose(jax.jit(algorithm.q_values)(head, z, key), expected, rtol=1e-4, atol=1e-5)
 
 
 def leaf_names(algorithm):
@@ -259,7 +259,7 @@ def test_rows_are_what_their_names_say():
     head, slow_head = (random_params(rows["dqn"].objective.init, seed) for seed in (1, 2))
     online, slow, window = make_case()
 
-    @jit
+    @jax.jit
     def losses(online, slow):
         arguments = head, slow_head, make_latents(online, slow), window, jax.random.key(0)
         return [rows[name].objective.loss(*arguments)[0] for name in ("dqn", "double")]
@@ -300,12 +300,12 @@ def test_rainbow_is_the_row_with_its_parts(row, options, double):
     whole = rl.rainbow(CONTEXT, distributional=row == "c51", **options)
     row = rl.REGISTRY[row](CONTEXT, **options)
     assert facts(whole) == facts(row)
-    heads = [jit(algorithm.objective.init)(jax.random.key(0)) for algorithm in (whole, row)]
+    heads = [jax.jit(algorithm.objective.init)(jax.random.key(0)) for algorithm in (whole, row)]
     assert identical(*heads)
     slow_head = random_params(row.objective.init, 2)
     online, slow, window = make_case()
 
-    @jit
+    @jax.jit
     def run(head, online, slow):
         arguments = head, slow_head, make_latents(online, slow), window, jax.random.key(0)
         return [algorithm.objective.loss(*arguments) for algorithm in (whole, row)]
@@ -335,13 +335,13 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
     network = heads.QNetwork(
         ACTIONS, 51, 512, dueling, True, 0.1, rl.normal_logits(ATOMS_51, init_std) if init_std else None
     )
-    head = jit(algorithm.objective.init)(jax.random.key(0))
+    head = jax.jit(algorithm.objective.init)(jax.random.key(0))
     z = np.random.default_rng(0).normal(size=(BATCH, FEATURES)).astype(np.float32)
-    probs = jit(lambda head, z: jax.nn.softmax(network.apply({"params": head}, z, None)))(head, z)
+    probs = jax.jit(lambda head, z: jax.nn.softmax(network.apply({"params": head}, z, None)))(head, z)
     mean = probs @ ATOMS_51
     std = np.sqrt(probs @ ATOMS_51**2 - mean**2)
     np.testing.assert_allclose(std, expected, rtol=0.15)
-    np.testing.assert_allclose(jit(algorithm.q_values)(head, z), mean, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(jax.jit(algorithm.q_values)(head, z), mean, rtol=1e-4, atol=1e-4)
     assert np.abs(mean).max() < 0.6
 
 
@@ -414,7 +414,7 @@ def test_values_are_learnt(kind, reward):
         latents = make_latents(online, slow)
         return algorithm.objective.loss(head, head, latents, window, jax.random.key(0))[0].mean()
 
-    @jit
+    @jax.jit
     def update(head, state):
         steps, state = adam.update(jax.grad(mean_loss)(head), state)
         return optax.apply_updates(head, steps), state

@@ -1,0 +1,66 @@
+"""Tests of experiments.analyses.answers: the numbers of docs/answers.md are those of the runs."""
+
+import json
+
+import pytest
+
+from experiments.analyses import answers
+from srl_jax.errors import ConfigError
+
+
+def test_the_page_says_what_the_runs_say():
+    page = answers.PAGE.read_text(encoding="utf-8")
+    assert answers.filled(page) == page
+    assert len(answers.MARK.findall(page)) > 30
+
+
+def test_the_head_of_the_page_is_in_the_readme():
+    head = answers.head(answers.PAGE.read_text(encoding="utf-8"))
+    assert "<!--" not in head and "](experiments/results/" in head
+    assert head in answers.README.read_text(encoding="utf-8")
+
+
+def test_a_number_of_a_file(tmp_path):
+    values = {
+        "share": 0.196,
+        "rows": [{"game": "Pong", "at": 9, "x": [1.0, 2.345]}, {"game": "Pong", "at": 18}],
+    }
+    (tmp_path / "a.json").write_text(json.dumps(values))
+    page = "<!--a.json; share; .0%-->?<!----> of <!--a.json; rows; Pong; 9; x; 1; +.2f--><!---->"
+    filled = "<!--a.json; share; .0%-->20 %<!----> of <!--a.json; rows; Pong; 9; x; 1; +.2f-->+2.35<!---->"
+    assert answers.filled(page, tmp_path) == filled
+
+
+@pytest.mark.parametrize(
+    "what, said",
+    [
+        ("a.json; shares; .0%", "no 'shares'"),
+        ("a.json; rows; Pong; x; .2f", "no 'x'"),  # two rows are of Pong
+        ("a.json; rows; Pong; 9; x; 5; .2f", "no '5'"),
+        ("a.json; share; .0k", "Unknown format|Invalid format"),
+        ("campaign Catch joint", "expected CAMPAIGN GAME ARM BASELINE"),
+        ("c G a b - c G a b - c G a b", "expected CAMPAIGN GAME ARM BASELINE"),
+        ("catch_weight Catch nobody rl_only_256", "catch_weight: nobody on Catch has no runs"),
+        ("catch_weight Catch rl_only_256 joint_256_weight10 8-10", r"no runs of the seeds \[10\]"),
+    ],
+)
+def test_a_mark_that_means_nothing_is_an_error(tmp_path, what, said):
+    results = answers.RESULTS
+    if what.startswith("a.json"):
+        results = tmp_path
+        values = {"share": 0.2, "rows": [{"game": "Pong", "at": 9, "x": [1.0]}, {"game": "Pong", "at": 18}]}
+        (tmp_path / "a.json").write_text(json.dumps(values))
+    with pytest.raises(ConfigError, match=said):
+        answers.number(what, results)
+
+
+def test_every_figure_of_a_packed_campaign_is_drawn_again():
+    found = dict(answers.commands())
+    drawn = {name for name in found if "/" in name}
+    every = {f"{path.parents[1].name}/{path.stem}" for path in answers.RESULTS.glob("*/figures/*.json")}
+    assert drawn == every
+    assert found["catch_separate/h1_joint"][4:6] == [
+        "--games=Catch,CatchDistractor",
+        "--seeds=10,11,12,13,14,15,16,17,18,19,",
+    ]
+    assert set(answers.ANALYSES.values()) == set(found) - drawn
