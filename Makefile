@@ -27,7 +27,7 @@ FAST := augment config data/data diagnostics/measures envs/base experiments/arms
 	replay/sumtree rl/losses run/actor run/ending specs statistics/statistics window
 
 .DEFAULT_GOAL := help
-.PHONY: help install check test train lint docs soak bench bench-gpu bench-install
+.PHONY: help install check test train lint docs soak bench bench-gpu bench-install answers
 
 help: ## list the targets
 	@sed -n 's/^\([a-z-]*\):[^#]*## /\1\t/p' $(MAKEFILE_LIST) | expand -t 15
@@ -63,6 +63,9 @@ docs: install ## write the API reference, build/docs/index.html
 
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .
+
+answers: install ## draw every figure and compute every number of docs/answers.md again (ten minutes)
+	@$(VENV)/bin/python -m experiments.analyses.answers $(ARGS)
 
 soak: install ## try to break what is promised about killed runs, disks, inputs and combinations (2.5 hours)
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[soak]'

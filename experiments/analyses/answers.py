@@ -1,0 +1,199 @@
+"""Draws again what the answers stand on: `python -m experiments.analyses.answers`, or `make answers`.
+
+Every figure of a campaign in results/ is drawn again from its packed runs, every analysis is made again, and
+every number that docs/answers.md marks is computed again. The table at the head of that page is README's as
+well. It says which files have changed; the status is 1 if one has.
+
+A mark is a comment that says what the text behind it is, up to the next empty comment. It is the difference
+of two arms' areas under the learning curve, an arm less its baseline, of all seeds or of those that are
+named. Two of them with a minus between are the difference of two differences. Or it is a number of a JSON
+file, found by keys, with a format at the end:
+
+    <!--catch_separate Catch joint_256 rl_only_256 10-14-->-0.55 [-0.71, -0.39]<!---->
+    <!--interval_claims/claims.json; nothing; 5; bootstrap; share; .0%-->11 %<!---->
+"""
+
+import functools
+import re
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from absl import flags
+
+from srl_jax import statistics
+from srl_jax.errors import ConfigError
+from srl_jax.files import display
+from srl_jax.files.reading import ROWS, read_json, replace_text
+
+from .. import packing
+from ..command_line import flags as config_flags
+from ..runs import collect
+from ..runs.run_data import RunData
+from .populations import RESULTS
+
+FLAGS = flags.FLAGS
+ROOT = RESULTS.parents[1]
+PAGE, README = ROOT / "docs" / "answers.md", ROOT / "README.md"
+ANALYSES = {"claims": "interval_claims", "coverage": "coverage", "predictors": "diagnostics_predict"}
+"""{module: the folder of results that it writes}."""
+MARK = re.compile(r"(<!--(?P<what>[^>]+?)-->)(?P<text>[^<]*)(<!---->)")
+HEAD = re.compile(r"(<!--head-->\n)(.*?)(\n<!--end-->)", re.DOTALL)
+"""The table at the head of the page, in README, too."""
+
+
+def filled(page: str, results: Path = RESULTS) -> str:
+    """A page, its marked numbers computed again.
+
+    Args:
+        page: Markdown with marks.
+        results: where campaigns are.
+
+    Raises:
+        ConfigError: a mark means nothing, or runs or a number are not there.
+    """
+    return MARK.sub(lambda mark: f"{mark[1]}{number(mark['what'], results)}{mark[4]}", page)
+
+
+def number(what: str, results: Path = RESULTS) -> str:
+    """What belongs behind a mark.
+
+    Args:
+        what: the mark's text.
+        results: where campaigns are.
+
+    Raises:
+        ConfigError: see `filled`.
+    """
+    if ";" in what:
+        path, *keys, form = (part.strip() for part in what.split(";"))
+        found = read_json(results / path, ROWS)
+        for key in keys:
+            found = _inside(found, key, what)
+        try:
+            return format(found, form).replace("%", " %")
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"<!--{what}-->: {error}") from None
+    differences = [part.split() for part in what.split(" - ")]
+    if len(differences) > 2 or any(len(words) not in (4, 5) for words in differences):
+        raise ConfigError(
+            f"<!--{what}-->: expected CAMPAIGN GAME ARM BASELINE, a second one behind a minus if need be, "
+            "each with FIRST-LAST behind it where not all seeds count; or FILE; KEY; ...; FORMAT"
+        )
+    groups = [
+        areas(results, campaigns, game, arm, *seeds)
+        for campaigns, game, *arms, seeds in ((*words[:4], words[4:]) for words in differences)
+        for arm in arms
+    ]
+    found = statistics.contrast(groups, (1, -1, -1, 1)[: len(groups)])
+    return f"{found.point:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
+
+
+def _inside(values: Any, key: str, what: str) -> Any:
+    """A value of an object or a list; of a list of objects those in which one value is the key."""
+    if isinstance(values, dict) and key in values:
+        return values[key]
+    if isinstance(values, list) and all(isinstance(row, dict) for row in values):
+        if kept := [row for row in values if key in map(str, row.values())]:
+            return kept if len(kept) > 1 else kept[0]
+    elif isinstance(values, list) and key.isdigit() and int(key) < len(values):
+        return values[int(key)]
+    raise ConfigError(f"<!--{what}-->: there is no {key!r}")
+
+
+def areas(results: Path, campaigns: str, game: str, arm: str, seeds: str = "") -> np.ndarray:
+    """The area under the learning curve of each run of an arm, float64 [runs].
+
+    Args:
+        results: where campaigns are.
+        campaigns: in which its runs are, with + between them.
+        game: that they are of.
+        arm: its name.
+        seeds: FIRST-LAST; "" for all.
+
+    Raises:
+        ConfigError: a run is not there.
+    """
+    runs = (run for part in campaigns.split("+") for run in _runs(results / part))
+    found = {run.seed: run for run in runs if (run.game, run.arm) == (game, arm)}
+    if seeds:
+        first, last = map(int, seeds.split("-"))
+        wanted = range(first, last + 1)
+    else:
+        wanted = sorted(found)
+    if missing := [seed for seed in wanted if seed not in found] or not found:
+        raise ConfigError(f"{results / campaigns}: {arm} on {game} has no runs of the seeds {missing}")
+    steps, returns = statistics.at_equal_steps([collect.steps_and_returns(found[seed]) for seed in wanted])
+    return statistics.area_under_curve(steps, returns)
+
+
+@functools.cache
+def _runs(folder: Path) -> Sequence[RunData]:
+    return packing.read(folder)
+
+
+def head(page: str) -> str:
+    """The table at the head of the page as README has it: without marks, its links from there."""
+    found = HEAD.search(page)
+    if found is None:
+        raise ConfigError(f"{PAGE}: has no table between <!--head--> and <!--end-->")
+    return MARK.sub(lambda mark: mark["text"], found[2]).replace("](../", "](")
+
+
+def commands(results: Path = RESULTS) -> Iterator[tuple[str, list[str]]]:
+    """(what it is, the arguments of Python) of each program that draws or computes again."""
+    for path in sorted(results.glob("*/figures/*.json")):
+        numbers = read_json(path, ROWS)
+        if not isinstance(numbers, dict) or not packing.is_packed(path.parents[1]):
+            continue
+        given = path.parents[1] / path.name
+        games = numbers["games"]
+        seeds = sorted(
+            {seed for game in games.values() for arm in game["arms"].values() for seed in arm["seeds"]}
+        )
+        figure = str(given) if given.exists() else numbers["figure"]
+        yield (
+            f"{path.parents[1].name}/{path.stem}",
+            [
+                "-m", "experiments.figures", "--redraw", f"--figure={figure}", f"--games={','.join(games)}",
+                f"--seeds={','.join(map(str, seeds))},", f"--out={path.parents[1]}",
+            ],
+        )  # fmt: skip
+    for module, folder in ANALYSES.items():
+        yield folder, ["-m", f"experiments.analyses.{module}", f"--out={results / folder}"]
+
+
+def contents(results: Path = RESULTS) -> dict[Path, bytes]:
+    """What is drawn or computed again: the pages, and numbers and pictures of campaigns and analyses."""
+    paths = [path for kind in ("json", "png", "md", "csv") for path in results.glob(f"*/figures/*.{kind}")]
+    paths += [path for folder in ANALYSES.values() for path in (results / folder).iterdir()]
+    return {path: path.read_bytes() for path in [PAGE, README, *paths]}
+
+
+def main(argv: list[str]) -> int:
+    """The entry point."""
+    del argv
+    before, todo = contents(), list(commands())
+    with display.Progress(len(todo), "redrawn") as progress:
+        for done, (what, arguments) in enumerate(todo):
+            progress.update(done, now=what)
+            ran = subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True)
+            if ran.returncode:
+                raise ConfigError(f"{what}: {ran.stderr.strip().splitlines()[-1]}")
+        progress.update(len(todo))
+    page = filled(PAGE.read_text(encoding="utf-8"))
+    replace_text(PAGE, page)
+    readme = README.read_text(encoding="utf-8")
+    replace_text(README, HEAD.sub(lambda found: f"{found[1]}{head(page)}{found[3]}", readme))
+    after = contents()
+    changed = [str(path.relative_to(ROOT)) for path in after if after[path] != before.get(path)]
+    lines = [f"{len(after) - len(changed)} files are as they were, byte for byte"]
+    display.result("\n".join(lines + [f"changed: {name}" for name in changed]))
+    return int(bool(changed))
+
+
+if __name__ == "__main__":
+    config_flags.run(main)
