@@ -63,6 +63,7 @@ _CATCH = {
     "eps_final": 0.02,
     "beta_anneal_steps": 70_000,
     "eval_games": 200,
+    "eval_envs": 100,  # a third of a short run's time went into playing them ten at once
 }
 # While it is being learnt: what is left to learn after these steps says little about an encoder.
 _SHORT = {
