@@ -6,8 +6,9 @@ well. It says which files have changed; the status is 1 if one has.
 
 A mark is a comment that says what the text behind it is, up to the next empty comment. It is the difference
 of two arms' areas under the learning curve, an arm less its baseline, of all seeds or of those that are
-named. Two of them with a minus between are the difference of two differences. Or it is a number of a JSON
-file, found by keys, with a format at the end:
+named. Two of them with a minus between are the difference of two differences. What is told from 0 after a
+correction for all differences of the page is bold. Or it is a number of a JSON file, found by keys, with a
+format at the end:
 
     <!--catch_separate Catch joint_256 rl_only_256 10-14-->-0.55 [-0.71, -0.39]<!---->
     <!--interval_claims/claims.json; nothing; 5; bootstrap; share; .0%-->11 %<!---->
@@ -17,7 +18,7 @@ import functools
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,8 @@ PAGE, README = ROOT / "docs" / "answers.md", ROOT / "README.md"
 ANALYSES = {"claims": "interval_claims", "coverage": "coverage", "predictors": "diagnostics_predict"}
 """{module: the folder of results that it writes}."""
 MARK = re.compile(r"(<!--(?P<what>[^>]+?)-->)(?P<text>[^<]*)(<!---->)")
+WEIGHTS = (1, -1, -1, 1)
+"""Of an arm and its baseline, and of those whose difference is taken off."""
 HEAD = re.compile(r"(<!--head-->\n)(.*?)(\n<!--end-->)", re.DOTALL)
 """The table at the head of the page, in README, too."""
 
@@ -55,41 +58,63 @@ def filled(page: str, results: Path = RESULTS) -> str:
     Raises:
         ConfigError: a mark means nothing, or runs or a number are not there.
     """
-    return MARK.sub(lambda mark: f"{mark[1]}{number(mark['what'], results)}{mark[4]}", page)
+    marks = dict.fromkeys(mark["what"] for mark in MARK.finditer(page))
+    texts = {what: number(what, results) for what in marks if ";" in what}
+    groups = {what: difference(what, results) for what in marks if ";" not in what}
+    bold = surviving(groups)
+    for what, arms in groups.items():
+        found = statistics.contrast(arms, WEIGHTS[: len(arms)])
+        text = f"{found.point:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
+        texts[what] = f"**{text}**" if what in bold else text
+    return MARK.sub(lambda mark: f"{mark[1]}{texts[mark['what']]}{mark[4]}", page)
+
+
+def surviving(differences: Mapping[str, Sequence[np.ndarray]], level: float = 0.95) -> set[str]:
+    """The differences that are told from 0 after Holm's correction for all of them (Holm 1979).
+
+    Args:
+        differences: name -> runs of each arm, as `difference` gives them.
+        level: of the interval that one of them alone would have.
+    """
+    kept: set[str] = set()
+    while True:  # those whose p is below the limit of the smallest one that is left
+        limit = 1 - (1 - level) / max(len(differences) - len(kept), 1)
+        found = {
+            name: statistics.contrast(arms, WEIGHTS[: len(arms)], limit)
+            for name, arms in differences.items()
+            if name not in kept
+        }
+        more = {name for name, interval in found.items() if interval.low > 0 or interval.high < 0}
+        if not more:
+            return kept
+        kept |= more
 
 
 def number(what: str, results: Path = RESULTS) -> str:
-    """What belongs behind a mark.
+    """The number of a JSON file that a mark means, see `filled`."""
+    path, *keys, form = (part.strip() for part in what.split(";"))
+    found = read_json(results / path, ROWS)
+    for key in keys:
+        found = _inside(found, key, what)
+    try:
+        return format(found, form).replace("%", " %")
+    except (TypeError, ValueError) as error:
+        raise ConfigError(f"<!--{what}-->: {error}") from None
 
-    Args:
-        what: the mark's text.
-        results: where campaigns are.
 
-    Raises:
-        ConfigError: see `filled`.
-    """
-    if ";" in what:
-        path, *keys, form = (part.strip() for part in what.split(";"))
-        found = read_json(results / path, ROWS)
-        for key in keys:
-            found = _inside(found, key, what)
-        try:
-            return format(found, form).replace("%", " %")
-        except (TypeError, ValueError) as error:
-            raise ConfigError(f"<!--{what}-->: {error}") from None
-    differences = [part.split() for part in what.split(" - ")]
-    if len(differences) > 2 or any(len(words) not in (4, 5) for words in differences):
+def difference(what: str, results: Path = RESULTS) -> list[np.ndarray]:
+    """The areas of the two or four arms that a mark means, float64 [runs] each, see `filled`."""
+    parts = [part.split() for part in what.split(" - ")]
+    if len(parts) > 2 or any(len(words) not in (4, 5) for words in parts):
         raise ConfigError(
             f"<!--{what}-->: expected CAMPAIGN GAME ARM BASELINE, a second one behind a minus if need be, "
             "each with FIRST-LAST behind it where not all seeds count; or FILE; KEY; ...; FORMAT"
         )
-    groups = [
+    return [
         areas(results, campaigns, game, arm, *seeds)
-        for campaigns, game, *arms, seeds in ((*words[:4], words[4:]) for words in differences)
+        for campaigns, game, *arms, seeds in ((*words[:4], words[4:]) for words in parts)
         for arm in arms
     ]
-    found = statistics.contrast(groups, (1, -1, -1, 1)[: len(groups)])
-    return f"{found.point:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
 
 
 def _inside(values: Any, key: str, what: str) -> Any:

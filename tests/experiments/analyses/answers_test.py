@@ -5,6 +5,7 @@ import json
 import pytest
 
 from experiments.analyses import answers
+from srl_jax import statistics
 from srl_jax.errors import ConfigError
 
 
@@ -51,7 +52,21 @@ def test_a_mark_that_means_nothing_is_an_error(tmp_path, what, said):
         values = {"share": 0.2, "rows": [{"game": "Pong", "at": 9, "x": [1.0]}, {"game": "Pong", "at": 18}]}
         (tmp_path / "a.json").write_text(json.dumps(values))
     with pytest.raises(ConfigError, match=said):
-        answers.number(what, results)
+        answers.filled(f"<!--{what}-->?<!---->", results)
+
+
+def test_what_survives_holms_correction(monkeypatch):
+    """The smallest p is compared with 0.05 over all of them, the next one with 0.05 over those left."""
+    limits = {"a": 0.01, "b": 0.02, "c": 0.04, "d": 0.03}
+
+    def contrast(arms, weights, level):
+        low = 1 - limits[arms] - level  # above 0 where p is below 1 - level
+        return statistics.Interval(1.0, low, 2.0, "")
+
+    monkeypatch.setattr(answers.statistics, "contrast", contrast)
+    assert answers.surviving({name: name for name in "abc"}) == {"a", "b", "c"}
+    assert answers.surviving({name: name for name in "bd"}) == {"b", "d"}
+    assert answers.surviving({name: name for name in "bdc"}) == set()
 
 
 def test_every_figure_of_a_packed_campaign_is_drawn_again():
