@@ -19,7 +19,7 @@ from srl_jax.layers import INITIALISERS
 from srl_jax.learning import modes
 from srl_jax.run import loop
 from srl_jax.training import completed
-from tests.helpers import write_checkpoint
+from tests.helpers import stop_after, write_checkpoint
 from tests.soak.conftest import different, remains, rows_of
 
 SMALL = {
@@ -208,12 +208,6 @@ def sentence(error: ConfigError) -> str:
     return re.sub(r"=\d[\d.e@>-]*", "=N", text)
 
 
-def stop_at(calls: int):
-    """stop: () -> bool, true when it is asked for the last time of so many."""
-    asked = iter(range(1, 10**6))
-    return lambda: next(asked) >= calls
-
-
 def not_finite(run: Path) -> list[str]:
     """The numbers of a run's rows that are none."""
     found = []
@@ -244,9 +238,8 @@ def run(drawn: Draw, folder: Path) -> str:
     assert not wrong, wrong
     full = Config.load(whole)
     # Among the updates, the first of which is at env step 60 of 96.
-    asked = random.Random(drawn.name).randrange(64, 92) // full.num_envs
-    with run_directory(resumed, full):
-        stopped = loop.train(full, resumed, progress=False, stop=stop_at(asked))
+    with run_directory(resumed, full), stop_after(random.Random(drawn.name).randrange(64, 92)) as stop:
+        stopped = loop.train(full, resumed, progress=False, stop=stop)
     assert stopped.interrupted
     manifest = checkpoint.read_manifest(resumed)
     checkpoint.verify(manifest)

@@ -1,6 +1,7 @@
 """What several tests share: an encoder that compiles quickly, random windows, comparisons of trees."""
 
 import dataclasses
+import itertools
 import json
 import os
 from collections.abc import Sequence
@@ -101,6 +102,28 @@ def shared_agents():
 
     with mock.patch.multiple(loop, make_agent=agent_of, over_seeds=seeds_of):
         yield
+
+
+@contextmanager
+def stop_after(env_steps: int, times: int = 1):
+    """A `stop` of a run that is obeyed after so many env steps, however often the loop asks before.
+
+    While a row waits for an evaluation, it asks as long as that takes.
+
+    Args:
+        env_steps: done.
+        times: when it is asked for the times-th time there.
+    """
+    from srl_jax.run import loop
+
+    step, done, asked = loop.Run.step, [0], itertools.count(1)
+
+    def counted(run):
+        step(run)
+        done[0] = run.env_steps
+
+    with mock.patch.object(loop.Run, "step", counted):
+        yield lambda: done[0] >= env_steps and next(asked) >= times
 
 
 def make_context(features: int = 8) -> Context:

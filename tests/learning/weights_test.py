@@ -23,7 +23,7 @@ from srl_jax.run import loop, saving
 from srl_jax.run.schedules import Schedules
 from srl_jax.specs import Weight, parse_weight
 from srl_jax.types import Objective
-from tests.helpers import SMALL, make_context, make_encoder, make_window, random_state
+from tests.helpers import SMALL, make_context, make_encoder, make_window, random_state, stop_after
 
 
 @pytest.mark.parametrize(
@@ -197,9 +197,8 @@ def alone(tmp_path_factory):
 
 def test_a_run_with_ratios_resumes_bit_identically(alone, tmp_path):
     agent, whole = alone
-    seen = []
-    stop = lambda: seen.append(1) or len(seen) > 28  # noqa: E731
-    loop.train(RUN, tmp_path, progress=False, agent=agent, stop=stop)
+    with stop_after(56) as stop:
+        loop.train(RUN, tmp_path, progress=False, agent=agent, stop=stop)
     saved = checkpoint.read_manifest(tmp_path)
     assert 0 < saved.updates < 30 and saved.updates % NORM_EVERY
     loop.train(RUN, tmp_path, progress=False, agent=agent, resume=saved)

@@ -1,8 +1,8 @@
 """srl_jax/run/evaluations.py: the games after the last env step, whatever ends a run meanwhile."""
 
 import dataclasses
-import itertools
 import json
+import threading
 import time
 
 import pytest
@@ -19,7 +19,7 @@ from srl_jax.files.resuming import all_to_resume, has_ended
 from srl_jax.run import ending, evaluations, loop
 from srl_jax.run.actor import seed_for
 from srl_jax.run.evaluations import FINAL, games
-from tests.helpers import SMALL, agent_of
+from tests.helpers import SMALL, agent_of, stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
@@ -113,17 +113,29 @@ def during(monkeypatch, do, kind=FINAL, moments=(40, 120)):
     monkeypatch.setattr(evaluations, "evaluate", play)
 
 
-def endless(stop):
-    while not stop():
-        time.sleep(0.01)
+class Endless:
+    """What takes as long as anybody waits for it.
+
+    Attributes:
+        begun: whether it has begun; a run's `stop`.
+    """
+
+    def __init__(self):
+        self._event = threading.Event()
+        self.begun = self._event.is_set
+
+    def __call__(self, stop):
+        self._event.set()
+        while not stop():
+            time.sleep(0.01)
 
 
 @pytest.mark.parametrize("kind", ["eval", FINAL])
 def test_a_stop_is_obeyed_at_once_and_the_row_is_the_same_later(whole, tmp_path, monkeypatch, kind):
-    path, asked = tmp_path / "run", itertools.count()
+    path, endless = tmp_path / "run", Endless()
     with monkeypatch.context() as patch:
-        during(patch, endless, kind)  # would take for ever
-        result = train(path, stop=lambda: next(asked) > 35)  # 30 steps come before
+        during(patch, endless, kind)
+        result = train(path, stop=endless.begun)
     assert result.interrupted and result.env_steps == result.saved == 120
     assert ending.read(path) == ("stopped", 120, "")
     assert kinds(path)[-1] == ("eval", 60 if kind == "eval" else 120)
@@ -135,10 +147,10 @@ def test_a_stop_is_obeyed_at_once_and_the_row_is_the_same_later(whole, tmp_path,
 
 
 def test_a_stop_is_obeyed_while_a_row_waits_for_an_evaluation(whole, tmp_path, monkeypatch):
-    path, asked = tmp_path / "run", itertools.count()
-    with monkeypatch.context() as patch:
-        during(patch, endless, "eval", [60])
-        result = train(path, stop=lambda: next(asked) > 25)
+    path = tmp_path / "run"
+    with monkeypatch.context() as patch, stop_after(76, times=3) as stop:
+        during(patch, Endless(), "eval", [60])
+        result = train(path, stop=stop)
     assert result.interrupted and result.env_steps == result.saved == 76  # a row is due after 80
     assert not resume(path).interrupted
     assert rows(path) == rows(whole)
@@ -177,10 +189,10 @@ def test_an_extended_run_plays_them_at_its_new_end(tmp_path, monkeypatch):
 
 def test_a_return_that_ends_a_run_early_is_followed_by_them(tmp_path, monkeypatch):
     config = dataclasses.replace(CONFIG, stop_at_return=-1.0)  # which every policy reaches
-    path, asked = tmp_path / "run", itertools.count()
+    path, endless = tmp_path / "run", Endless()
     with monkeypatch.context() as patch:
         during(patch, endless)
-        result = train(path, config, stop=lambda: next(asked) > 12)
+        result = train(path, config, stop=endless.begun)
     assert result.interrupted and result.env_steps == 40
     resume(path, config)
     assert kinds(path) == [("eval", 0), ("final", 40)]

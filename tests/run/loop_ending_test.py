@@ -16,7 +16,7 @@ from srl_jax.files.metrics import read_metrics
 from srl_jax.replay import Replay
 from srl_jax.run import actor, ending, evaluations, loop
 from srl_jax.run.reporting import Report
-from tests.helpers import JOINT, SMALL, whole
+from tests.helpers import JOINT, SMALL, stop_after, whole
 from tests.run.loop_test import train
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
@@ -44,10 +44,10 @@ def test_ctrl_c_in_the_middle_of_a_step_leaves_the_last_checkpoint(tmp_path, mon
 
 
 def test_a_run_that_is_told_to_stop_saves_and_leaves_it_to_others_to_say_so(tmp_path, capsys):
-    calls = itertools.count()
     path = tmp_path / "run"
-    result = train(path, progress=True, stop=lambda: next(calls) == 13)
-    assert result.interrupted and result.env_steps == result.saved == 13 * 4
+    with stop_after(52) as stop:
+        result = train(path, progress=True, stop=stop)
+    assert result.interrupted and result.env_steps == result.saved == 52
     assert "stopped" not in "".join(capsys.readouterr())  # the command says it, with how to resume, once
     assert whole(path).env_steps == 52 and "run.json" in whole(path).files
 
@@ -62,8 +62,8 @@ def test_a_stop_waits_for_no_evaluation(tmp_path, monkeypatch, env_steps):
         return original(policy, env, stop=stop, **options)
 
     monkeypatch.setattr(evaluations, "evaluate", play)
-    calls = itertools.count()
-    result = train(tmp_path / "run", progress=True, stop=lambda: next(calls) == env_steps // 4)
+    with stop_after(env_steps) as stop:
+        result = train(tmp_path / "run", progress=True, stop=stop)
     assert result.interrupted and result.env_steps == result.saved == env_steps
 
 
@@ -183,8 +183,8 @@ def test_early_stop(tmp_path):
 
 def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
     path, config = tmp_path / "run", Config(**SMALL)
-    asked = itertools.count()
-    assert train(path, checkpoint_every=40, stop=lambda: next(asked) == 15).interrupted
+    with stop_after(60) as stop:
+        assert train(path, checkpoint_every=40, stop=stop).interrupted
     assert ending.read(path) == ("stopped", 60, "") and not ending.read(path).failed
     manifest, rows = whole(path), (path / "metrics.jsonl").read_bytes()
     # What is refused changes nothing.

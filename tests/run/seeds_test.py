@@ -1,7 +1,5 @@
 """Several seeds in one process are the runs that they would be alone."""
 
-import itertools
-
 import numpy as np
 import pytest
 
@@ -11,6 +9,7 @@ from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.run import ending, loop
 from srl_jax.run.loop import train_seeds
+from tests.helpers import stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
@@ -63,16 +62,16 @@ def test_seeds_differ(runs):
 
 
 def test_seeds_that_are_stopped_and_go_on_are_those_that_were_not(runs, path, tmp_path):
-    stop = 35  # two env steps a step: in an evaluation; of one seed, resume_test.py stops everywhere
+    steps = 70  # in an evaluation; of one seed, resume_test.py stops everywhere
     outs = [tmp_path / "s7", tmp_path / "s3"]
     for out in outs:
         out.mkdir()
-    asked = itertools.count()
     train = lambda **options: train_seeds(Config(**CONFIG), [7, 3], outs, progress=False, **options)  # noqa: E731
-    results = train(stop=lambda: next(asked) >= stop)
-    assert [(r.interrupted, r.env_steps) for r in results] == [(True, 2 * stop)] * 2
+    with stop_after(steps) as stop:
+        results = train(stop=stop)
+    assert [(r.interrupted, r.env_steps) for r in results] == [(True, steps)] * 2
     manifests = [checkpoint.newest_good(out, pytest.fail) for out in outs]
-    assert [(m.env_steps, m.config.seed) for m in manifests] == [(2 * stop, 7), (2 * stop, 3)]
+    assert [(m.env_steps, m.config.seed) for m in manifests] == [(steps, 7), (steps, 3)]
     results = train(resume=manifests)
     assert [(r.interrupted, r.updates) for r in results] == [(False, 20)] * 2
     for out in outs:
