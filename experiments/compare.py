@@ -89,8 +89,11 @@ def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[
         path, game, name, _, config, *_ = members[0]
         if out := {run.seed: whys[run.path] for run in members if run.path in whys}:
             notes.append(f"{game}, {collect.left_out_text(name, out, len(members))}")
-        if curves := [collect.steps_and_values(run, key) for run in members if run.path not in whys]:
+        curves = [collect.steps_and_values(run, key) for run in members if run.path not in whys]
+        if curves := [curve for curve in curves if len(curve[0])]:
             arms.append(Arm(game, name, str(path), config, curves))
+        elif not out:
+            notes.append(f"{game}, {name}: has no policy")
     if not arms:
         raise ConfigError(f"--runs: nothing to draw; {'; '.join(notes)}")
     return [arm._replace(label=label) for arm, label in zip(arms, _labels(arms), strict=True)], notes
@@ -150,14 +153,11 @@ def table(arms: Sequence[Arm], key: str) -> str:
     lines = []
     for game in dict.fromkeys(arm.game for arm in arms):
         members = [arm for arm in arms if arm.game == game]
-        until = min(int(steps[-1]) for arm in members for steps, _ in arm.curves)
+        until, ends = collect.ends({i: arm.curves for i, arm in enumerate(members)})
         rows = [(f"{game}, {key}", "seeds", f"at {until:,} env steps", "area under the curve", "")]
-        for arm in members:
-            try:
-                ends = collect.ends(arm.curves, until).values()
-            except ValueError as error:
-                raise ConfigError(f"--runs: {arm.place}: {error}") from None
-            area, last = (_interval(statistics.estimate(statistics.mean, {game: x})) for x in ends)
+        for i, arm in enumerate(members):
+            both = (statistics.estimate(statistics.mean, {game: x}) for x in ends[i].values())
+            area, last = map(_interval, both)
             rows.append((arm.label, str(len(arm.curves)), last, area, arm.place))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines += ["  ".join(map(str.ljust, row, widths)).rstrip() for row in rows]

@@ -120,8 +120,7 @@ def evaluated(
         if not members:
             continue
         found = {name: [steps_and_returns(run) for run in arm] for name, arm in members.items()}
-        until = min(int(steps[-1]) for arm in found.values() for steps, _ in arm)
-        ends = {name: collect.ends(arm, until) for name, arm in found.items()}
+        until, ends = collect.ends(found)
         entry: dict[str, Any] = {"equal_until": until, "arms": {}}
         for name, arm in found.items():
             values = {"seeds": [run.seed for run in members[name]]} | _curve(arm)
@@ -299,6 +298,8 @@ def run(values: flags.FlagValues) -> int:
         methods = _names(text, atari100k_methods()) if values["published"].present else None
     else:
         methods = _names(text, (entry.method for game in envs.ATARI_57 for entry in published(game)))
+    if values["dry_run"].value and values["redraw"].value:
+        raise ConfigError("--dry_run: --redraw starts no run; leave one of them out")
     if values["dry_run"].value:
         workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
         entries = manifest.resolve(runs)
@@ -341,7 +342,7 @@ def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directo
         why = "".join(f"; {line}" for line in left_out_lines(numbers))
         raise ConfigError(f"no evaluation of any arm of figure {figure.name} in {directory.parent}{why}")
     directory.mkdir(exist_ok=True)
-    (directory / f"{figure.name}.json").write_text(json.dumps(numbers, indent=1) + "\n")
+    replace_text(directory / f"{figure.name}.json", json.dumps(numbers, indent=1) + "\n")
     return draw(figure, numbers, directory / f"{figure.name}.png")
 
 
@@ -378,6 +379,7 @@ def write_scores(
     if not numbers["games"]:
         whys = (f"; {run['game']}, {run['arm']}: {run['reason']}" for run in numbers["left_out"][:3])
         raise ConfigError(f"no score of any arm of figure {figure.name} in {directory.parent}{''.join(whys)}")
+    numbers["presets"] = {arm.name: arm.preset for arm in figure.arms}
     directory.mkdir(exist_ok=True)
     name = directory / figure.name
     replace_text(name.with_suffix(".json"), json.dumps(numbers, indent=1) + "\n")

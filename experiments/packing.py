@@ -147,7 +147,7 @@ def added(here: Sequence[RunData], more: Iterable[RunData]) -> list[RunData]:
 def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     """Adds the runs in or below a directory to those that are packed in a folder.
 
-    A run that is under way, or was killed, is left out: it may still get other rows.
+    A run that is under way, was stopped or killed is left out: it may still get other rows.
 
     Args:
         root: a run keeps its path below it.
@@ -164,11 +164,12 @@ def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
     here = read(folder) if is_packed(folder) else []
-    whole = added([], (run for run in found if run.over))
+    under_way = [run for run in found if not run.over or (run.ended and run.ended.status == "stopped")]
+    whole = added([], (run for run in found if run not in under_way))
     runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
-    return len(runs) - len(here), len(runs), [run.path for run in found if not run.over]
+    return len(runs) - len(here), len(runs), [run.path for run in under_way]
 
 
 def unpack(folder: Path, root: Path) -> int:
@@ -245,7 +246,7 @@ def _rows(path: Path, only_last: bool) -> dict[tuple[str, str, int], list[dict[s
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from None
     runs = [line.partition(b', "kind"')[0] for line in lines]
-    for number, (line, run, after) in enumerate(zip(lines, runs, [*runs[1:], b""], strict=True), 1):
+    for number, (line, run, after) in enumerate(zip(lines, runs, [*runs, b""][1:], strict=True), 1):
         if only_last and run == after:
             continue
         try:
@@ -275,13 +276,16 @@ def main(argv: list[str]) -> None:
     runs, out = Path(os.path.expanduser(FLAGS.runs)), paths.check_place("out", FLAGS.out)
     if not runs.is_dir():
         raise ConfigError(f"--runs={FLAGS.runs}: no such directory")
+    one, other = runs.resolve(), out.resolve()
+    if not FLAGS.unpack and (one == other or one in other.parents or other in one.parents):
+        raise ConfigError(f"--out={FLAGS.out}: name a folder that is neither in --runs nor around it")
     try:
         if FLAGS.unpack:
             print(f"{out}: {unpack(runs, out)} runs unpacked")
         else:
             more, count, left_out = pack(runs, out)
             for path in left_out:
-                display.say(f"{path}: left out: it is under way, or was killed and can be resumed")
+                display.say(f"{path}: left out: it is under way, or was stopped or killed and can be resumed")
             print(f"{out}: {more} runs added, {count} in all")
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error

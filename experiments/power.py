@@ -62,8 +62,7 @@ def of_runs(root: Path, only: str | None = None) -> dict[str, list[Spread]]:
     found: dict[str, list[Spread]] = {}
     for game, arms in collect.grouped(collect.comparable(runs)).items():
         curves = {arm: [collect.steps_and_returns(run) for run in its] for arm, its in arms.items()}
-        until = min(int(steps[-1]) for its in curves.values() for steps, _ in its)
-        areas = {arm: collect.ends(its, until)["area_under_curve"] for arm, its in curves.items()}
+        areas = {arm: its["area_under_curve"] for arm, its in collect.ends(curves)[1].items()}
         spreads = [Spread(arm, len(x), float(x.std(ddof=1))) for arm, x in areas.items() if len(x) >= FEWEST]
         if spreads and only in (None, game):
             found[game] = [*spreads, pooled(spreads)]

@@ -1,5 +1,6 @@
 """Training as one call, and the checks that come before. Imports no jax until they need it."""
 
+import dataclasses
 import os
 from collections.abc import Collection, Mapping
 from pathlib import Path
@@ -101,8 +102,23 @@ def resolved(config: Config, given: Collection[str] = ()) -> Config:
     size = config.frame_size or 84
     _, _, terms = components(config, (size, size, 1), num_actions=18)
     Views.of(config)
-    checks.run_of(full, **built(full, terms)).refuse(given)
+    refuse_unread(config, full, terms, given)
     return full
+
+
+def refuse_unread(
+    config: Config, full: Config, terms: Mapping[str, "Objective"], given: Collection[str]
+) -> None:
+    """Raises ConfigError where nothing reads a field that was given.
+
+    Args:
+        config: as it was given, where a rate of 0 is that of another group.
+        full: `completed`.
+        terms: the objectives that were made of it.
+        given: fields.
+    """
+    asked = dataclasses.replace(full, lr_encoder=config.lr_encoder, lr_encoder_srl=config.lr_encoder_srl)
+    checks.run_of(asked, **built(full, terms)).refuse(given)
 
 
 def built(config: Config, terms: Mapping[str, "Objective"]) -> dict[str, Any]:

@@ -67,8 +67,8 @@ class Encoder(NamedTuple):
         observation_shape: (H, W, S * C).
         make_decoder: (extra_inputs: int = 0) -> Decoder; its input is the latent joined with that many
             more numbers (a one-hot action, say). None where there is no decoder.
-        map_shape: (H', W', C'), the last convolution's map of one observation before it is flattened; None
-            where there is none, or it is not known.
+        map_shape: (H', W', C') of the maps that the latent is, flattened; None where it is behind a linear
+            layer or a pool, or nothing is known of it.
         steps: what `apply` computes, step by step, for a program without this one, see
             `srl_jax.encoders.files.to_npz`; None where nothing says it.
         make_tied_decoder: () -> Decoder whose convolutions have the transposes of the encoder's kernels; None

@@ -18,7 +18,7 @@ from srl_jax.layers import INITIALISERS
 from srl_jax.learning.agent import components
 from srl_jax.needs import EVERYTHING, Unread
 from srl_jax.rl.values import PRIORITIES
-from srl_jax.training import built, completed
+from srl_jax.training import completed, refuse_unread
 from srl_jax.types import Context
 from tests.helpers import NUM_ACTIONS, SMALL
 from tests.observed import BESIDE, of_agent, of_algorithm, of_encoder, of_objective
@@ -157,6 +157,8 @@ BASES = {
     "joint": with_objectives("reconstruction"),
     "summed": with_objectives("inverse:hidden=8", encoder_optimizer="summed"),
     "no head": with_objectives("latent_l2", encoder_optimizer="summed"),
+    "no head, two Adams": with_objectives("latent_l2"),
+    "no head, decoupled": with_objectives("latent_l2", mode="decoupled"),
     "ratio": with_objectives("latent_l2:weight=ratio:0.1"),
     "srl_stopped": with_objectives("inverse:hidden=8", gate="srl_stopped"),
     "decoupled": with_objectives("inverse:hidden=8", mode="decoupled"),
@@ -191,7 +193,11 @@ FLAGS: dict[str, tuple] = {
     "reset_last": (70, ["heads"], ["rl_only"]),
     "shrink": (0.8, ["all"], ["heads"]),
     "lr_rl": (1e-3, ["rl_only", "frozen"], ["pretrain"]),
-    "lr_srl": (1e-3, ["summed", "decoupled"], ["rl_only", "no head", "ratio"]),
+    "lr_srl": (
+        1e-3,
+        ["summed", "decoupled", "no head, two Adams", "no head, decoupled"],
+        ["rl_only", "no head", "ratio"],
+    ),
     "lr_encoder": (1e-3, ["rl_only", "pretrain"], ["frozen"]),
     "lr_encoder_srl": (1e-3, ["joint"], ["rl_only", "frozen", "summed", "ratio", "decoupled"]),
     "decoder_weight_decay": (1e-3, ["joint"], ["rl_only", "summed"]),
@@ -228,10 +234,11 @@ def base(name: str, **values) -> Config:
 
 def resolved(config: Config, given) -> Config:
     """As `srl_jax.training.resolved`, at the size of the frames."""
-    config = completed(checks.check(config, given=given), given)
-    _, _, terms = components(config, (42, 42, 1), NUM_ACTIONS)
-    checks.run_of(config, **built(config, terms)).refuse(given)
-    return config
+    config = checks.check(config, given=given)
+    full = completed(config, given)
+    _, _, terms = components(full, (42, 42, 1), NUM_ACTIONS)
+    refuse_unread(config, full, terms, given)
+    return full
 
 
 @functools.cache

@@ -1,6 +1,6 @@
 """Draws again what the answers stand on: `python -m experiments.analyses.answers`, or `make answers`.
 
-Every figure of a campaign in results/ is drawn again from its packed runs, every analysis is made again, and
+Every figure whose numbers and packed runs are in results/ is drawn again, every analysis is made again, and
 every number that docs/answers.md marks is computed again. The table at the head of that page is README's as
 well. It says which files have changed; the status is 1 if one has.
 
@@ -31,6 +31,7 @@ from srl_jax.files import display
 from srl_jax.files.reading import ROWS, read_json, replace_text
 
 from .. import packing
+from ..arms import SCORES
 from ..command_line import flags as config_flags
 from ..runs import collect
 from ..runs.run_data import RunData
@@ -111,9 +112,9 @@ def difference(what: str, results: Path = RESULTS) -> list[np.ndarray]:
             "each with FIRST-LAST behind it where not all seeds count; or FILE; KEY; ...; FORMAT"
         )
     return [
-        areas(results, campaigns, game, arm, *seeds)
+        area
         for campaigns, game, *arms, seeds in ((*words[:4], words[4:]) for words in parts)
-        for arm in arms
+        for area in areas(results, campaigns, game, arms, *seeds)
     ]
 
 
@@ -129,30 +130,40 @@ def _inside(values: Any, key: str, what: str) -> Any:
     raise ConfigError(f"<!--{what}-->: there is no {key!r}")
 
 
-def areas(results: Path, campaigns: str, game: str, arm: str, seeds: str = "") -> np.ndarray:
-    """The area under the learning curve of each run of an arm, float64 [runs].
+def areas(results: Path, campaigns: str, game: str, arms: Sequence[str], seeds: str = "") -> list[np.ndarray]:
+    """The areas under the learning curves of arms, as figures compare them, float64 [runs] each.
 
     Args:
         results: where campaigns are.
-        campaigns: in which its runs are, with + between them.
+        campaigns: in which the runs are, with + between them.
         game: that they are of.
-        arm: its name.
+        arms: their names.
         seeds: FIRST-LAST; "" for all.
 
     Raises:
-        ConfigError: a run is not there.
+        ConfigError: a run is not there, is there twice or failed, or runs cannot be compared.
     """
-    runs = (run for part in campaigns.split("+") for run in _runs(results / part))
-    found = {run.seed: run for run in runs if (run.game, run.arm) == (game, arm)}
-    if seeds:
-        first, last = map(int, seeds.split("-"))
-        wanted = range(first, last + 1)
-    else:
-        wanted = sorted(found)
-    if missing := [seed for seed in wanted if seed not in found] or not found:
-        raise ConfigError(f"{results / campaigns}: {arm} on {game} has no runs of the seeds {missing}")
-    steps, returns = statistics.at_equal_steps([collect.steps_and_returns(found[seed]) for seed in wanted])
-    return statistics.area_under_curve(steps, returns)
+    every = [run for part in campaigns.split("+") for run in _runs(results / part)]
+    first, _, last = seeds.partition("-")
+    if seeds and not (first.isdigit() and last.isdigit()):
+        raise ConfigError(f"{seeds}: expected the seeds as FIRST-LAST, 10-14")
+    found: dict[str, list[RunData]] = {}
+    for arm in arms:
+        own = [run for run in every if (run.game, run.arm) == (game, arm)]
+        there = sorted(run.seed for run in own)
+        wanted = list(range(int(first), int(last) + 1)) if seeds else sorted(set(there))
+        missing = [seed for seed in wanted if there.count(seed) != 1]
+        if missing or not own:
+            where = f"{results / campaigns}: {arm} on {game}"
+            raise ConfigError(f"{where} has not one run of each of its seeds, see {missing or 'none'}")
+        found[arm] = [run for run in own if run.seed in wanted]
+    compared = [run for runs in found.values() for run in runs]
+    collect.check_arms(compared)
+    collect.check_protocols(compared)
+    if left := collect.left_out(compared):
+        raise ConfigError(f"{left[0][0].path}: cannot be compared: {left[0][1]}")
+    curves = {arm: [collect.steps_and_returns(run) for run in runs] for arm, runs in found.items()}
+    return [ends["area_under_curve"] for ends in collect.ends(curves)[1].values()]
 
 
 @functools.cache
@@ -175,15 +186,20 @@ def commands(results: Path = RESULTS) -> Iterator[tuple[str, list[str]]]:
         if not isinstance(numbers, dict) or not packing.is_packed(path.parents[1]):
             continue
         given = path.parents[1] / path.name
-        games = numbers["games"]
-        seeds = sorted(
-            {seed for game in games.values() for arm in game["arms"].values() for seed in arm["seeds"]}
-        )
+        scores = numbers["figure"] == SCORES
+        arms = numbers["arms"].values() if scores else numbers["games"].values()
+        of_game = [values for arm in arms for values in arm["games" if scores else "arms"].values()]
+        seeds = sorted({seed for values in of_game for seed in values["seeds"]})
         figure = str(given) if given.exists() else numbers["figure"]
+        arguments = [f"--figure={figure}", f"--games={','.join(numbers['games'])}"]
+        if scores:
+            arguments.append(f"--presets={','.join(numbers['presets'].values())}")
+        if numbers["forced"]:
+            arguments.append("--force")
         yield (
             f"{path.parents[1].name}/{path.stem}",
             [
-                "-m", "experiments.figures", "--redraw", f"--figure={figure}", f"--games={','.join(games)}",
+                "-m", "experiments.figures", "--redraw", *arguments,
                 f"--seeds={','.join(map(str, seeds))},", f"--out={path.parents[1]}",
             ],
         )  # fmt: skip
@@ -193,8 +209,14 @@ def commands(results: Path = RESULTS) -> Iterator[tuple[str, list[str]]]:
 
 def contents(results: Path = RESULTS) -> dict[Path, bytes]:
     """What is drawn or computed again: the pages, and numbers and pictures of campaigns and analyses."""
-    paths = [path for kind in ("json", "png", "md", "csv") for path in results.glob(f"*/figures/*.{kind}")]
-    paths += [path for folder in ANALYSES.values() for path in (results / folder).iterdir()]
+    names = [name.split("/") for name, _ in commands(results) if "/" in name]
+    paths = [path for folder, name in names for path in (results / folder / "figures").glob(f"{name}.*")]
+    paths += [
+        path
+        for folder in ANALYSES.values()
+        for path in (results / folder).iterdir()
+        if path.name != "README.md"
+    ]
     return {path: path.read_bytes() for path in [PAGE, README, *paths]}
 
 
@@ -207,7 +229,8 @@ def main(argv: list[str]) -> int:
             progress.update(done, now=what)
             ran = subprocess.run([sys.executable, *arguments], cwd=ROOT, capture_output=True, text=True)
             if ran.returncode:
-                raise ConfigError(f"{what}: {ran.stderr.strip().splitlines()[-1]}")
+                said = ran.stderr.strip().splitlines() or [f"exit status {ran.returncode}"]
+                raise ConfigError(f"{what}: {said[-1]}")
         progress.update(len(todo))
     page = filled(PAGE.read_text(encoding="utf-8"))
     replace_text(PAGE, page)

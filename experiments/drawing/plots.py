@@ -5,6 +5,7 @@ whether they can be. Figures are built as objects, without pyplot: no global sta
 """
 
 import importlib.util
+import io
 import os
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
@@ -16,6 +17,7 @@ import numpy as np
 from srl_jax import envs, statistics
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
+from srl_jax.files.reading import replace_bytes
 
 from ..runs import collect
 from .colours import Style, styles
@@ -348,5 +350,7 @@ def save(figure, path: str | os.PathLike) -> Path:
     # A palette makes the file a third as large, and nobody sees the difference.
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-    image.quantize(256).save(path, format="PNG", optimize=True)
+    content = io.BytesIO()
+    image.quantize(256).save(content, format="PNG", optimize=True)
+    replace_bytes(path, content.getvalue())
     return path

@@ -144,18 +144,41 @@ def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
     return steps_and_values(run, RETURN)
 
 
-def ends(curves: Sequence[tuple[np.ndarray, np.ndarray]], until: int) -> dict[str, np.ndarray]:
-    """What arms are compared by, float64 [runs] each: up to an env step that all of them have.
+Curves = Sequence[tuple[np.ndarray, np.ndarray]]
+"""Of an arm's runs, as of `steps_and_returns`."""
+
+
+def ends(arms: Mapping[Any, Curves]) -> tuple[int, dict[Any, dict[str, np.ndarray]]]:
+    """What arms of a game are compared by: between the env steps that all of their curves have.
 
     Args:
-        curves: of an arm's runs, as of `steps_and_returns`.
-        until: that env step.
+        arms: the curves of each.
+
+    Returns:
+        The last of these env steps; and for each arm the area under the curve up to there and the value
+        there, float64 [runs].
+
+    Raises:
+        ConfigError: there is no such step.
     """
-    grid, returns = statistics.at_equal_steps(curves)
-    return {
-        "area_under_curve": statistics.area_under_curve(grid, returns, until),
-        "at_the_end": np.array([np.interp(until, grid, one) for one in returns]),
-    }
+    every = [steps for curves in arms.values() for steps, _ in curves]
+    start, until = max(int(steps[0]) for steps in every), min(int(steps[-1]) for steps in every)
+    if start > until:
+        raise ConfigError(
+            f"--runs: no env step that all curves have: one begins at {start:,}, another ends at {until:,}"
+        )
+    found = {}
+    for arm, curves in arms.items():
+        grid, returns = statistics.at_equal_steps(curves)
+        if start > grid[0]:
+            later = grid > start
+            first = [[np.interp(start, grid, one)] for one in returns]
+            grid, returns = np.append(start, grid[later]), np.hstack([first, returns[:, later]])
+        found[arm] = {
+            "area_under_curve": statistics.area_under_curve(grid, returns, until),
+            "at_the_end": np.array([np.interp(until, grid, one) for one in returns]),
+        }
+    return until, found
 
 
 def has_policy(run: RunData) -> bool:
@@ -227,16 +250,19 @@ def check_arms(runs: Sequence[RunData]) -> None:
                     )
 
 
-def check_protocols(runs: Sequence[RunData], *, force: bool = False, more: Sequence[str] = ()) -> list[str]:
+def check_protocols(
+    runs: Sequence[RunData], *, force: bool = False, more: Sequence[str] = (), across_games: bool = False
+) -> list[str]:
     """Whether returns of these runs mean the same: one protocol for each game.
 
     Args:
         runs: those without a policy's returns do not count.
         force: say what differs, and do not refuse.
         more: fields beside `PROTOCOL` that must be the same.
+        across_games: whether it is one for each arm, in all of its games.
 
     Returns:
-        A line for each run whose protocol is not that of the game's first.
+        A line for each run whose protocol is not that of the game's, or the arm's, first.
 
     Raises:
         ConfigError: there is one, and it is not forced.
@@ -246,7 +272,7 @@ def check_protocols(runs: Sequence[RunData], *, force: bool = False, more: Seque
     for run in runs:
         if not len(steps_and_returns(run)[0]):
             continue
-        reference = first.setdefault(run.game, run)
+        reference = first.setdefault(run.arm if across_games else run.game, run)
         if differing := difference(reference.config, run.config, (*PROTOCOL, *more)):
             found.append(f"{run.path}: another protocol than {reference.path}: {differing}")
     if found and not force:

@@ -10,6 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srl_jax import data, envs, statistics
+from srl_jax.errors import ConfigError
+from srl_jax.files import provenance
 
 from . import collect
 from .json_values import limits, plain
@@ -104,6 +106,7 @@ def evaluated(
     runs = [run for run in runs if run.arm in arms and run.game in games]
     collect.check_arms(runs)
     forced = collect.check_protocols(runs, force=force)
+    forced += collect.check_protocols(runs, force=force, more=("steps",), across_games=True)
     scores = {run.key: end_score(run) for run in runs}
     groups = collect.grouped(run for run in runs if scores[run.key][0])
     known = [game for game in games if game in groups]
@@ -141,8 +144,8 @@ def evaluated(
             "beside": list(others),
             "steps": config.steps,
             "of": sorted({score.of for its in own.values() for score in its}),
-            "cores": sorted({run.about.get("cores") or 0 for run in everything}),
-            "revisions": sorted({str(run.about.get("git_revision")) for run in everything}),
+            "cores": sorted({x or 0 for run in everything for x in _all(run, "cores")}),
+            "revisions": sorted({str(x) for run in everything for x in _all(run, "git_revision")}),
             "differs": {name: _differs(name, members) for name in others},
             "games": {},
             "aggregates": _aggregates({game: values[game] for game in common}),
@@ -160,6 +163,14 @@ def evaluated(
                 **_distance(game, float(found.point), others),
             }
     return result
+
+
+def _all(run: RunData, field: str) -> list[Any]:
+    """What a run says of where and by what it ran, at its start and wherever it was resumed."""
+    try:
+        return provenance.history(run.about).get(field) or [None]
+    except ValueError as error:
+        raise ConfigError(f"{run.path}: {error}") from None
 
 
 def _published(name: str, games: Sequence[str], common: Sequence[str]) -> dict[str, Any]:
@@ -187,15 +198,18 @@ def _published(name: str, games: Sequence[str], common: Sequence[str]) -> dict[s
 
 
 def _differs(name: str, members: Mapping[str, Sequence[RunData]]) -> str:
-    """What differs between a published method's scores and these runs', in a line."""
+    """What differs between a published method's scores and these runs', by game where games differ."""
+    texts: dict[str, list[str]] = {}
     for game, runs in members.items():
         rows = [row for row in data.published(game) if (row.method, row.env_steps) == (name, STEPS)]
         if rows:
             text = collect.differs(rows[0], runs[0].config, seeds=len(runs))
             if (cut := runs[0].config.eval_max_steps) != CUT:
                 text = f"games cut after {CUT:,} env steps (here {cut:,}){'; ' if text else ''}{text}"
-            return text
-    return "no score of these games"
+            texts.setdefault(text, []).append(game)
+    if len(texts) > 1:
+        return "; ".join(f"{', '.join(games)}: {text or 'nothing'}" for text, games in texts.items())
+    return next(iter(texts), "no score of these games")
 
 
 def _distance(game: str, mean: float, others: Sequence[str]) -> dict[str, Any]:

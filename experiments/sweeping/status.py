@@ -91,8 +91,9 @@ def rates(
 def alike(config: Config) -> tuple:
     """What runs have in common that take equally long: game, network, losses, and updates for an env step."""
     losses = tuple(specs.split(text)[0] for text in config.objectives)
-    work = config.updates_per_step, config.batch_size
-    return envs.known(config.game).kind, config.encoder, config.mode, losses, *work
+    work = config.updates_per_step, config.batch_size, config.srl_every, config.frame_size
+    how = config.encoder, config.mode, config.encoder_optimizer, specs.split(config.rl)[0]
+    return envs.known(config.game).kind, *how, losses, *work
 
 
 def _timed(config: Config, got: Progress) -> bool:
@@ -116,7 +117,8 @@ def _published() -> Sums:
     for folder in packing.folders_below(RESULTS):
         with contextlib.suppress(ConfigError):  # of an earlier version
             runs += packing.read(folder, only_last=True)
-    return sums((run.config, Progress(run.rows[-1]["env_steps"], run.rows[-1]["wall_s"])) for run in runs)
+    last = [(run.config, run.rows[-1]) for run in runs if run.rows]
+    return sums((config, Progress(row["env_steps"], row["wall_s"])) for config, row in last)
 
 
 def seconds_left(
@@ -293,8 +295,11 @@ def best(runs: Sequence[RunData]) -> list[str]:
         if len(arms) < 2:
             continue
         curves = {arm: [collect.steps_and_returns(run) for run in its] for arm, its in arms.items()}
-        until = min(int(steps[-1]) for arm in curves.values() for steps, _ in arm)
-        ends = {arm: collect.ends(its, until) for arm, its in curves.items()}
+        try:
+            until, ends = collect.ends(curves)
+        except ConfigError as error:  # one has not got to where another one begins
+            found.append(f"{game}: {error}")
+            continue
         areas = {
             arm: statistics.estimate(statistics.mean, {game: its["area_under_curve"]})
             for arm, its in ends.items()

@@ -157,9 +157,7 @@ def convolutional_encoder(
     latent = end.latent((*sizes[-1], layers[-1].channels), features, own_end)
     network = EncoderNetwork(layers, start, pads, latent, activation, lix)
     decoder = DecoderNetwork(layers, start, pads, latent, sizes[:-1], channels, sigmoid, activation)
-    encoder = flax_encoder(
-        network, decoder, observation_shape, map_shape=latent.map_shape, noisy=lix is not None
-    )
+    encoder = flax_encoder(network, decoder, observation_shape, map_shape=latent.maps, noisy=lix is not None)
     make_decoder = encoder.make_decoder
     assert make_decoder
     return encoder._replace(

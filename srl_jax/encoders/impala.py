@@ -139,4 +139,4 @@ def impala(
     latent = end.latent((*sizes[-1], channels[-1]), features, "relu")
     network = ImpalaEncoder(channels, start, latent)
     decoder = ImpalaDecoder(channels, start, latent, tuple(sizes[:-1]), depth)
-    return flax_encoder(network, decoder, observation_shape, map_shape=latent.map_shape)
+    return flax_encoder(network, decoder, observation_shape, map_shape=latent.maps)

@@ -117,6 +117,11 @@ class Latent(NamedTuple):
         """D, how many numbers the latent has."""
         return self.features or (self.map_shape[-1] if self.pool == "average" else math.prod(self.map_shape))
 
+    @property
+    def maps(self) -> tuple[int, int, int] | None:
+        """The shape of the maps that the latent is, flattened; None behind a linear layer or a pool."""
+        return None if self.features or self.pool != "none" else self.map_shape
+
     def encode(self, x: Array) -> Array:
         """[B, H', W', C'] -> [B, D]; its layers belong to the module whose compact method calls it."""
         if self.pool == "average":

@@ -13,6 +13,7 @@ from srl_jax.files.checkpoint import Manifest
 from srl_jax.files.metrics import read_metrics
 from srl_jax.files.reading import read_json
 from srl_jax.run import ending
+from srl_jax.specs import value_text
 
 ENDS = ("steps", "stop_at_return")
 """Fields that say when a run ends."""
@@ -124,9 +125,12 @@ def to_resume(
     if differing := another_run(completed(manifest.config), wanted):
         raise ConfigError(f"{manifest.path}: of another configuration: {differing}")
     if checkpoint.NUMBERS not in manifest.files:
-        if wanted.steps > there.steps:
+        early = manifest.env_steps < wanted.steps and wanted.stop_at_return != there.stop_at_return
+        if early or wanted.steps > there.steps:
+            flag = "stop_at_return" if early else "steps"
+            value = value_text(getattr(wanted, flag))
             raise ConfigError(
-                f"--steps={wanted.steps}: the run in {path} has ended after {manifest.env_steps} env steps "
+                f"--{flag}={value}: the run in {path} has ended after {manifest.env_steps} env steps "
                 "and left no replay to resume with; --keep_replay beside training keeps it"
             )
         return manifest
@@ -247,10 +251,9 @@ def has_ended(path: Path, manifest: Manifest, wanted: Config) -> bool:
     """
     if checkpoint.NUMBERS not in manifest.files:
         return True
-    if manifest.env_steps < wanted.steps:
-        return False
     ended = ending.read(path)  # a run of --keep_replay
-    return ended is not None and ended.status == "finished"
+    over = manifest.env_steps >= wanted.steps or not difference(manifest.config, wanted, ENDS)
+    return over and ended is not None and ended.status == "finished"
 
 
 def first_checkpoint(wanted: Config) -> int:

@@ -3,6 +3,7 @@
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
+from srl_jax import specs
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Spec, parse_change, value_text
 
@@ -87,6 +88,11 @@ def check(config: "Config", mode: "Mode") -> None:
             raise ConfigError(
                 f"--{name}={text}: ends at --gamma, which is {config.gamma}; give --gamma={end}"
             )
+    start = parse(written(config.gamma_anneal, float), float).start if config.gamma_anneal else config.gamma
+    if not min(start, config.gamma) and any(specs.split(text)[0] == "terminal" for text in config.objectives):
+        flag = f"gamma_anneal={config.gamma_anneal}" if config.gamma else "gamma=0"
+        why = "a discount of 0 is how --objective=terminal knows a terminal state"
+        raise ConfigError(f"--{flag}: {why}; give a gamma above 0")
     if config.reset == "none":
         return
     if not config.reset_every:
@@ -100,8 +106,8 @@ def check(config: "Config", mode: "Mode") -> None:
 
 
 def check_n(text: str, rl: Spec) -> None:
-    """Raises ConfigError where the larger n is not the n_step of --rl, which windows are made for."""
-    largest = max(parse(text, int)[:2])
+    """Raises ConfigError where n does not fit --rl: windows are made for its n_step, the larger n."""
+    smallest, largest = sorted(parse(text, int)[:2])
     found = rl.resolved.get("n_step")
     if found is None:
         raise ConfigError(f"--n_anneal={text}: --rl={rl.name} has no option n_step")
@@ -109,3 +115,5 @@ def check_n(text: str, rl: Spec) -> None:
         raise ConfigError(
             f"--n_anneal={text}: --rl has n_step={found}; give --rl=:n_step={largest}, the larger n"
         )
+    if rl.resolved.get("target") == "s_t+n-1" and smallest < 2:
+        raise ConfigError(f"--n_anneal={text}: with --rl=:target=s_t+n-1 n is at least 2")

@@ -1,6 +1,6 @@
 """Parameter groups and the optimizer: decoder weight decay, clipping, Adam, a learning rate per group."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 import jax
@@ -61,14 +61,22 @@ def make_optimizer(
     Args:
         objectives: by name; those with `is_decoder` decay.
         decoder_weight_decay: the factor of a decoder's parameters in its gradient.
-        weight_decay: the share per learning rate, of every group that moves.
+        weight_decay: the share per learning rate, of every group that moves, but for `others` of an update:
+            groups of another pass, of which this one moves a part.
         max_grad_norm: the global norm that gradients are clipped to; 0 for no clipping.
         adam_eps: Adam's epsilon.
     """
     adam = optax.scale_by_adam(BETA_1, BETA_2, adam_eps)
     decays = {name for name, objective in objectives.items() if objective.is_decoder and decoder_weight_decay}
 
-    def update(grads, state, params, learning_rates: dict[str, Array], measure: Array | bool = True):
+    def update(
+        grads,
+        state,
+        params,
+        learning_rates: dict[str, Array],
+        measure: Array | bool = True,
+        others: Collection[str] = (),
+    ):
         norms = {}
         if ENCODER in grads:
             norms[ENCODER] = measured(measure, optax.tree.norm, grads[ENCODER])
@@ -82,7 +90,7 @@ def make_optimizer(
             if group in decays:
                 gradient = jax.tree.map(lambda g, p: g + decoder_weight_decay * p, gradient, tree)
             steps, new_state[group] = adam.update(gradient, state[group])
-            if weight_decay:
+            if weight_decay and group not in others:
                 steps = jax.tree.map(lambda u, p: u + weight_decay * p if p.ndim > 1 else u, steps, tree)
             rate = learning_rates[group]
             moved[group] = jax.tree.map(lambda p, u: p - rate * u, tree, steps)  # noqa: B023

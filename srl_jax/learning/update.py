@@ -303,6 +303,7 @@ def make_update(
                 before,
                 {group: rates[rate_of(name)] for group, name in one.groups.items()},
                 measure,
+                [group for group, name in one.groups.items() if name == RL_SRL],
             )
             params = params | moved
             opt_state = opt_state | {one.groups[group]: x for group, x in moments.items()}

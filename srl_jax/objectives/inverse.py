@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.layers import Dense
+from srl_jax.objectives.networks import masked_mean
 from srl_jax.specs import check_size
 from srl_jax.types import Array, Context, Latents, Objective, Window
 
@@ -48,7 +49,8 @@ def inverse(context: Context, *, weight: float = 1.0, hidden: int = 256, steps: 
     def loss(head, slow_head, latents: Latents, window: Window, key):
         logits: Any = network.apply({"params": head}, latents.online(0), latents.online(steps))
         losses = jax.vmap(action_cross_entropy)(logits, window.actions[:, 0])
-        correct = jnp.mean(jnp.argmax(logits, -1) == window.actions[:, 0])
-        return window.valid[:, steps - 1] * losses, {"accuracy": jax.lax.stop_gradient(correct)}
+        valid = window.valid[:, steps - 1]
+        correct = masked_mean(jnp.argmax(logits, -1) == window.actions[:, 0], valid)
+        return valid * losses, {"accuracy": jax.lax.stop_gradient(correct)}
 
     return Objective(lambda key: network.init(key, z, z)["params"], loss, weight, horizon=steps)

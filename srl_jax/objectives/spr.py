@@ -1,7 +1,5 @@
 """Self-predictive representations: SPR (Schwarzer et al. 2021)."""
 
-import math
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
@@ -82,10 +80,8 @@ def spr(
     check_choice("projection", projection, PROJECTIONS)
     check_choice("target", target, TARGETS)
     features = context.features
-    shape = context.map_shape or ()
-    if math.prod(shape) != features or len(shape) != 3:
-        shape = (1, 1, features)
-    init_transition, transition = functions(Transition(tuple(shape)), features, context.num_actions)
+    shape = context.map_shape or (1, 1, features)
+    init_transition, transition = functions(Transition(shape), features, context.num_actions)
     parts = {"transition": init_transition}
     if projection == "own":
         parts["projection"], project = functions(Dense(hidden), features)

@@ -69,7 +69,8 @@ def byol(
 
 def variance_loss(z: Array) -> jax.Array:
     """`mean_d max(0, 1 - std_d)` over the batch: float32 [B, D] -> [] (Bardes et al. 2022, equation 1)."""
-    return jnp.mean(jax.nn.relu(1 - jnp.sqrt(jnp.var(z, 0, ddof=1) + 1e-4)))
+    variance = jnp.sum((z - jnp.mean(z, 0)) ** 2, 0) / max(len(z) - 1, 1)  # one row has none
+    return jnp.mean(jax.nn.relu(1 - jnp.sqrt(variance + 1e-4)))
 
 
 def covariance_loss(z: Array) -> jax.Array:
@@ -78,7 +79,7 @@ def covariance_loss(z: Array) -> jax.Array:
     Bardes et al. (2022), equations 3 and 4.
     """
     centred = z - jnp.mean(z, 0)
-    covariance = centred.T @ centred / (len(z) - 1)
+    covariance = centred.T @ centred / max(len(z) - 1, 1)
     return jnp.sum((covariance * (1 - jnp.eye(z.shape[-1], dtype=jnp.float32))) ** 2) / z.shape[-1]
 
 
@@ -95,7 +96,9 @@ def vicreg(
 ) -> Objective:
     """Two views alike, features varied and uncorrelated (Bardes et al. 2022, equation 6). No slow copy.
 
-    The gradient flows into the expander and, through the latents of both views, into the encoder.
+    As in the authors' code, and not in the equation, the squared distance of the views is a mean over D, and
+    the variance term the mean of both views'. The gradient flows into the expander and, through the latents
+    of both views, into the encoder.
 
     Args:
         hidden, outputs: width of the expander's hidden layer and size of what it gives.
@@ -114,7 +117,7 @@ def vicreg(
         both = [view.online(0) for view in two_views(draw, latents, window, key)]
         z = jnp.split(expand(head, jnp.concatenate(both)), 2)
         alike = jnp.mean((z[0] - z[1]) ** 2, -1)
-        varied = sum(map(variance_loss, z))
+        varied = sum(map(variance_loss, z)) / 2
         apart = sum(map(covariance_loss, z))
         metrics = {"invariance": jnp.mean(alike), "variance": varied, "covariance": apart}
         losses = invariance * alike + variance * varied + covariance * apart

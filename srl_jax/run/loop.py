@@ -72,7 +72,8 @@ def train_seeds(
 ) -> list[Result]:
     """Trains an agent of each seed, in step, writing rows and checkpoints into run directories.
 
-    How a run ended goes to its `ended.json`, see `srl_jax.run.ending`; a ConfigError changes nothing there.
+    How a run ended goes to its `ended.json`, see `srl_jax.run.ending`; a ConfigError before its first step
+    changes nothing there.
     What stops one seed stops all; a return that ends a run early must be reached by all in one evaluation.
 
     Args:
@@ -96,9 +97,9 @@ def train_seeds(
     try:
         run = Run(configs, paths, progress=progress, agent=agent, resume=resume, stop=stop)
         results = run.train()
-    except ConfigError:
-        raise
     except BaseException as error:
+        if isinstance(error, ConfigError) and not (run and run.begun):
+            raise
         for path in paths:  # of several, those that did nothing wrong were stopped
             own = error if getattr(error, "run", path) == path else KeyboardInterrupt()
             with contextlib.suppress(SaveError):  # what ended the run is what is told
@@ -145,6 +146,7 @@ class Run:
             for seed in self.seeds:
                 seed.policy = policy(named_key(seed.key, "given policy"))
         self.env_steps = self.updates = 0
+        self.begun = False  # whether its directories say that it is under way
         self.waiting: list[dict] = []  # metrics of updates, on the device
         if resume is None:
             start = initial_params(config, frame, self.agent)
@@ -180,6 +182,7 @@ class Run:
         with self:
             for seed in self.seeds:
                 ending.clear(seed.out)
+            self.begun = True
             try:
                 finished = self.run()
             except KeyboardInterrupt:
@@ -218,10 +221,11 @@ class Run:
             if (log or evaluate) and not self.played():  # its rows come before the next ones
                 return False
             self.step()
-            if (log or evaluate) and self.finish_evaluation():
-                break
+            reached = (log or evaluate) and self.finish_evaluation()
             if log:
                 self.write_train_rows()
+            if reached:
+                break
             save = save and self.env_steps < config.steps
             if save:
                 self.keep_encoders()
@@ -411,3 +415,4 @@ class Run:
             seed.save_parameters(params, self.env_steps, self.updates)
         for seed in self.seeds:  # until all have theirs, they can be resumed from the ones before
             saving.slim_before(seed.out, self.env_steps)
+            seed.saved = None

@@ -1,13 +1,14 @@
 """What a checkpoint holds of the learner: the parameters that act, which others load, and the rest."""
 
 import contextlib
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from srl_jax.errors import ConfigError
+from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
 from srl_jax.learning.agent import Agent
@@ -59,6 +60,20 @@ def slim_before(run: Path, env_steps: int) -> None:
             manifest = checkpoint.read_manifest(path)
             if checkpoint.NUMBERS in manifest.files and manifest.env_steps < env_steps:
                 checkpoint.slim(manifest)
+
+
+def drop_after(run: Path, env_steps: int) -> None:
+    """Removes the best parameters of after an env step that a run resumes from; it may not get there again.
+
+    Raises:
+        SaveError: they cannot be removed.
+    """
+    for path in (run / "best").glob("[0-9]*"):
+        if int(path.name) > env_steps:
+            try:
+                shutil.rmtree(path)
+            except OSError as error:
+                raise SaveError(f"{path}: not removed: {error.strerror or error}") from error
 
 
 @contextlib.contextmanager

@@ -60,7 +60,8 @@ class Seed:
         except (ValueError, MemoryError) as error:
             raise ConfigError(
                 f"--buffer_size={config.buffer_size}: {error}; --num_envs={config.num_envs}, "
-                f"--frame_stack={config.frame_stack} and --rl={config.rl} say how much it takes"
+                f"--frame_stack={config.frame_stack} and a horizon of {agent.horizon}, the largest of --rl "
+                "and --objective, say how much it takes"
             ) from None
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
@@ -209,6 +210,7 @@ class Seed:
         Raises:
             ConfigError: the checkpoint is not of such a run, or the environments do not come back to what was
                 seen; names the file or says what differs.
+            SaveError: what is better than it and of a later step cannot be removed.
         """
         with saving.resumable(manifest):
             state = saving.restored(self.agent, manifest)
@@ -222,5 +224,6 @@ class Seed:
                 # One that was to be the last is not, where the run is extended.
                 if under_way.kind != FINAL or not difference(manifest.config, self.config, ENDS):
                     self.evaluations.under_way = under_way
+        saving.drop_after(self.out, manifest.env_steps)
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         return state

@@ -84,7 +84,8 @@ def estimate_difference(
     """
     ours, theirs = by_game(x), by_game(y)
     check_games(ours, theirs)
-    mine, base = _terms(statistic, ours), _terms(statistic, theirs)
+    fewest = min(x.shape[-1] for arm in (ours, theirs) for x in arm.values())
+    mine, base = (_terms(statistic, arm, fewest) for arm in (ours, theirs))
     if mine is not None and base is not None:
         groups = [*mine.values(), *base.values()]
         if len(mine) == 1:
@@ -114,10 +115,19 @@ def curve_interval(returns: Any, statistic: Statistic = mean, *, level: float = 
     return bootstrap_curve(returns, statistic, level=level, **how)
 
 
-def _terms(statistic: Statistic, games: Mapping[str, np.ndarray]) -> dict[str, np.ndarray] | None:
-    """game -> [..., runs], whose means have the statistic as their mean; None where there are no such."""
+def _terms(
+    statistic: Statistic, games: Mapping[str, np.ndarray], fewest: int | None = None
+) -> dict[str, np.ndarray] | None:
+    """game -> [..., runs], whose means have the statistic as their mean; None where there are no such.
+
+    Args:
+        statistic: of the arm.
+        games: its scores.
+        fewest: runs that a game of any arm has; None for those of this one.
+    """
     if statistic in MEANS or (statistic is median and len(games) == 1):
         return {game: statistic({game: x[..., None]}) for game, x in games.items()}
     if statistic is interquartile_mean and len(games) >= MANY:
-        return interquartile_terms(games) if min(x.shape[-1] for x in games.values()) < FEW else None
+        fewest = fewest or min(x.shape[-1] for x in games.values())
+        return interquartile_terms(games) if fewest < FEW else None
     return None

@@ -93,7 +93,8 @@ def test_decoders_mirror_every_option(name, shape, options):
     image = jax.eval_shape(decoder.apply, jax.eval_shape(decoder.init, jax.random.key(0)), z)
     assert image.shape == (2, *shape)
     if "pool" in options:
-        assert encoder.features == encoder.map_shape[-1]
+        flat = encoders.REGISTRY[name](shape, features=0)
+        assert (encoder.features, encoder.map_shape) == (flat.map_shape[-1], None)
 
 
 def test_a_same_decoder_is_the_transposed_encoder():
@@ -350,8 +351,13 @@ def test_doubling_by_hand():
 def test_where_a_map_is_flattened_its_shape_is_known():
     shapes = {"nature": (7, 7, 64), "sac_ae": (35, 35, 32), "tiny": (9, 9, 16), "impala": (11, 11, 32)}
     shapes |= {"der": (3, 3, 64), "a_lix": (37, 37, 32), "mrq": (7, 7, 32)}
-    assert {n: row((84, 84, 4)).map_shape for n, row in encoders.REGISTRY.items()} == shapes
+    flat = {name: row((84, 84, 4), features=0) for name, row in encoders.REGISTRY.items()}
+    assert {name: encoder.map_shape for name, encoder in flat.items()} == shapes
     assert encoders.nature((64, 96, 4)).map_shape == (5, 8, 64)
+    # A latent behind a linear layer is none, not even one with as many numbers as its maps have.
+    assert encoders.tiny((42, 42, 4), features=0).features == 256
+    assert encoders.tiny((42, 42, 4), features=256).map_shape is None
+    assert encoders.nature((84, 84, 4), pool="average").map_shape is None
 
 
 # Any flax module

@@ -161,3 +161,13 @@ def test_games_that_differ_have_panels_of_their_own_where_that_is_forced(runs, t
     assert [panel.game for panel in drawn[0][0]] == ["Catch", "Pong"]
     _compare(runs / "a", runs / "noisy", "--force", f"--out={tmp_path / 'y.png'}")
     assert "another protocol" in drawn[1][1]
+
+
+def test_a_run_without_a_policy_is_said_and_left_out(tmp_path, capsys):
+    write_run(tmp_path / "a")
+    run = write_run(tmp_path / "pretrain", mode="pretrain", objectives=("latent_l2",))
+    rows = [row for row in map(json.loads, (run / "metrics.jsonl").read_text().splitlines())]
+    kept = [{k: x for k, x in row.items() if k != "eval/return_mean"} for row in rows]
+    (run / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in kept))
+    _compare(tmp_path / "a", run)
+    assert "pretrain: has no policy" in "".join(capsys.readouterr())

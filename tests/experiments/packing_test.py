@@ -225,6 +225,9 @@ def test_the_command_line(root, tmp_path, monkeypatch, capsys):
     for arguments, why in (
         ([f"--out={tmp_path / 'new'}"], "--runs: missing"),
         ([root], "--out: missing"),
+        ([root, f"--out={root}"], "name a folder that is neither in --runs nor around it"),
+        ([root, f"--out={root / 'packed'}"], "name a folder that is neither in --runs nor around it"),
+        ([root, f"--out={root.parent}"], "name a folder that is neither in --runs nor around it"),
         ([tmp_path / "none", f"--out={tmp_path / 'new'}"], "--runs=.*none: no such directory"),
         ([tmp_path / "out", f"--out={tmp_path / 'new'}"], "out: no run directory there"),
         ([root, f"--out={root / 'alone_seed10/config.json'}"], "exists and is not a directory"),
@@ -233,3 +236,18 @@ def test_the_command_line(root, tmp_path, monkeypatch, capsys):
         with pytest.raises(ConfigError, match=why):
             main(*arguments)
     assert not (tmp_path / "new").exists()
+
+
+def test_a_run_that_was_stopped_is_packed_when_it_has_ended(tmp_path):
+    run = write_run(tmp_path / "runs/Catch/a/seed0", (0, 1), ended=Ending("stopped", 100))
+    write_run(tmp_path / "runs/Catch/a/seed1", (0, 1, 2), ended=Ending("finished", 200), seed=1)
+    assert packing.pack(tmp_path / "runs", tmp_path / "out") == (1, 1, [run])
+
+
+def test_a_run_without_rows_is_read(tmp_path):
+    run = write_run(tmp_path / "runs/Catch/a/seed0", ended=NOT_FINITE)
+    (run / "metrics.jsonl").write_text("")
+    packing.pack(tmp_path / "runs", tmp_path / "out")
+    (read,) = packing.read(tmp_path / "out")
+    assert read.rows == [] and read.ended == NOT_FINITE
+    assert packing.read(tmp_path / "out", only_last=True)[0].rows == []

@@ -129,6 +129,9 @@ def test_a_run_is_extended_and_says_what_depends_on_its_end(tmp_path, capsys):
     assert to_resume(run, longer).files.keys() == {"params.msgpack"}
     with pytest.raises(ConfigError, match="has ended after 100 env steps and left no replay.*--keep_replay"):
         to_resume(run, dataclasses.replace(longer, steps=longer.steps + 1))
+    # Nor one that had reached its return before its last step.
+    with pytest.raises(ConfigError, match="^--stop_at_return=5.0: .* has ended after 100 env steps"):
+        to_resume(run, dataclasses.replace(longer, stop_at_return=5.0))
 
 
 def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
@@ -129,6 +130,18 @@ def test_real_copy_survives_the_donation_of_its_original():
     assert params["kernel"].is_deleted()
     np.testing.assert_array_equal(copy["kernel"], np.ones((3, 2)))
     assert float(jax.random.uniform(copy["key"])) == float(jax.random.uniform(jax.random.key(0)))
+
+
+def test_a_group_of_another_pass_does_not_decay():
+    params = {"rl": {"kernel": jnp.ones((2, 2))}, "own": {"kernel": jnp.ones((2, 2))}}
+    optimizer = make_optimizer({}, weight_decay=0.5)
+    nothing = jax.tree.map(jnp.zeros_like, params)
+    moved, _, _ = optimizer.update(
+        nothing, optimizer.init(params), params, {"rl": 0.1, "own": 0.1}, others=["rl"]
+    )
+    assert float(moved["rl"]["kernel"][0, 0]) == 1 and float(moved["own"]["kernel"][0, 0]) == pytest.approx(
+        0.95
+    )
 
 
 def test_decoupled_decay_is_optax_adamws_but_for_what_has_one_axis():

@@ -177,6 +177,8 @@ def test_without_flags_rows_and_windows_have_nothing_new():
 
 # What is refused
 
+TERMINAL = {"mode": "joint", "objectives": ("terminal:hidden=0",)}
+
 
 @pytest.mark.parametrize(
     ("values", "message"),
@@ -188,6 +190,8 @@ def test_without_flags_rows_and_windows_have_nothing_new():
         ({"gamma_anneal": "0.9->1@5"}, "--gamma_anneal=0.9->1@5: 1.0 must be at least 0 and below 1"),
         ({"gamma_anneal": "0.9->0.997@5"}, "ends at --gamma, which is 0.99; give --gamma=0.997"),
         ({"gamma_anneal": "0.9->0.99@5", "mode": "pretrain"}, "--mode=pretrain, which trains no RL"),
+        ({"gamma": 0.0, **TERMINAL}, "--gamma=0: a discount of 0 is how --objective=terminal knows"),
+        ({"gamma_anneal": "0->0.99@5", **TERMINAL}, "--gamma_anneal=0->0.99@5: a discount of 0 is how"),
         ({"reset": "head"}, "--reset=head: give --reset_every"),
         ({"reset_every": 5}, "--reset_every=5: nothing reads it with --reset=none"),
         ({"reset_last": 5}, "--reset_last=5: nothing reads it with --reset=none"),
@@ -225,9 +229,12 @@ def test_a_schedule_that_means_the_same_is_the_same_configuration():
 
 
 def test_the_larger_n_is_that_of_rl():
-    def resolved(rl):
-        registry = {"rainbow": lambda context, *, n_step=3: None, "own": lambda context, *, hidden=3: None}
-        return resolve(Config(rl=rl, n_anneal="10->3@1e4"), registry, {"nature": lambda shape: None}, {})
+    def resolved(rl, n_anneal="10->3@1e4"):
+        registry = {
+            "rainbow": lambda context, *, n_step=3, target="s_t+n": None,
+            "own": lambda context, *, hidden=3: None,
+        }
+        return resolve(Config(rl=rl, n_anneal=n_anneal), registry, {"nature": lambda shape: None}, {})
 
     assert "n_step=10" in resolved("rainbow:n_step=10").rl
     for rl, message in (
@@ -236,6 +243,11 @@ def test_the_larger_n_is_that_of_rl():
     ):
         with pytest.raises(ConfigError, match=message):
             resolved(rl)
+    # One step ahead of s_t less one is s_t itself.
+    late = "rainbow:n_step=10,target=s_t+n-1"
+    assert resolved(late, "10->2@5")
+    with pytest.raises(ConfigError, match="--n_anneal=10->1@5: with --rl=:target=s_t.n-1 n is at least 2"):
+        resolved(late, "10->1@5")
 
 
 def test_a_schedule_is_written_as_it_is_read():

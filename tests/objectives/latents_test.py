@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import objectives
+from srl_jax import encoders, objectives
 from srl_jax.augment import make_view
 from srl_jax.latents import make_latents
 from srl_jax.objectives.bisimulation import bisimulation_error
@@ -20,7 +20,7 @@ from srl_jax.objectives.slowness import similarity, squared_step
 from srl_jax.objectives.spr import min_max
 from srl_jax.objectives.two_views import covariance_loss, cross_correlation, variance_loss
 from srl_jax.objectives.vae import gaussian_divergence
-from srl_jax.types import Latents, Window
+from srl_jax.types import Context, Latents, Window
 from tests import helpers
 from tests.helpers import (
     NUM_ACTIONS,
@@ -135,7 +135,10 @@ def test_spr_has_a_convolutional_transition_where_the_latent_is_a_map():
     kernels = jax.eval_shape(objectives.spr(context).init, jax.random.key(0))["transition"]
     assert kernels["first"]["kernel"].shape == (3, 3, 4 + NUM_ACTIONS, 4)
     assert kernels["second"]["kernel"].shape == (3, 3, 4, 4)
-    behind_a_bottleneck = objectives.spr(make_context(D)._replace(map_shape=(2, 3, 4)))
+    tiny = Context.of(encoders.tiny((42, 42, 4), features=256), NUM_ACTIONS)  # its maps are of 256, too
+    kernels = jax.eval_shape(objectives.spr(tiny).init, jax.random.key(0))["transition"]
+    assert kernels["first"]["kernel"].shape == (1, 1, 256 + NUM_ACTIONS, 256)
+    behind_a_bottleneck = objectives.spr(make_context(D))
     kernels = jax.eval_shape(behind_a_bottleneck.init, jax.random.key(0))["transition"]
     assert kernels["first"]["kernel"].shape == (1, 1, D + NUM_ACTIONS, D)
 
@@ -154,6 +157,20 @@ def test_variance_and_covariance_of_vicreg_by_hand():
     assert float(variance_loss(z)) == pytest.approx((1 - np.sqrt(0.5 + 1e-4)) / 2, rel=1e-5)
     # The covariance of (-1, 1) and (0, 1) is 1: 1 twice, over two features.
     assert float(covariance_loss(jnp.array([[-1.0, 0.0], [1.0, 1.0]]))) == pytest.approx(1.0)
+    # A single row has neither.
+    assert float(variance_loss(z[:1])) == pytest.approx(0.99) and float(covariance_loss(z[:1])) == 0
+
+
+def test_vicreg_weighs_its_terms_as_the_authors_code_does():
+    """Twice the same latents: 2 of variance for the mean of both views, 3 of each view's covariance."""
+    objective = objectives.vicreg(
+        make_context(D), hidden=0, outputs=D, invariance=5.0, variance=2.0, covariance=3.0, view="none"
+    )
+    z = draw(1, BATCH, D)
+    losses, head, _ = loss_of(objective, latents_of(z), make_window())
+    expanded = z[0] @ np.asarray(head["Dense_0"]["kernel"]) + np.asarray(head["Dense_0"]["bias"])
+    expected = 2 * float(variance_loss(expanded)) + 6 * float(covariance_loss(expanded))
+    np.testing.assert_allclose(losses, expected, rtol=1e-5)
 
 
 def test_barlows_correlation_is_numpys():
@@ -329,6 +346,10 @@ def test_the_inverse_model_looks_as_far_as_it_is_told():
     other, _ = objective.loss(head, None, latents_of(z), window, None)
     assert objective.horizon == 3 and losses[0] == 0 and np.all(losses[1:] > 0)
     assert np.array_equal(losses, again) and not np.array_equal(losses, other)
+    # The accuracy is of valid rows.
+    window.valid[1:, 2] = 0
+    _, metrics = objective.loss(head, None, latents_of(z), window, None)
+    assert metrics["accuracy"] == 0
 
 
 def test_latents_are_pulled_to_zero_or_to_the_slow_ones():

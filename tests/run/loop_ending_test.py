@@ -1,5 +1,6 @@
 """How a run ends: told to, interrupted, diverged, with a full disk; and what it leaves."""
 
+import dataclasses
 import errno
 import itertools
 import os
@@ -13,9 +14,11 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged, SaveError
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics
+from srl_jax.files.resuming import has_ended
 from srl_jax.replay import Replay
 from srl_jax.run import actor, ending, evaluations, loop
 from srl_jax.run.reporting import Report
+from srl_jax.run.seed import Seed
 from tests.helpers import JOINT, SMALL, stop_after, whole
 from tests.run.loop_test import train
 
@@ -178,7 +181,32 @@ def test_early_stop(tmp_path):
     # Every return is at least -1, the untrained policy's too; it is known before the first row is written.
     assert result.env_steps == 40 and ending.read(tmp_path / "run") == ("finished", 40, "")
     assert checkpoint.read_manifest(tmp_path / "run").env_steps == 40
-    assert [row["kind"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl")] == ["eval"]
+    # What was learnt until then is written; without replay nothing can be resumed from.
+    assert [row["kind"] for row in read_metrics(tmp_path / "run" / "metrics.jsonl")] == ["eval", "train"]
+    assert result.saved is None
+
+
+def test_a_run_that_had_reached_its_return_has_ended_though_it_kept_its_replay(tmp_path):
+    path = tmp_path / "run"
+    train(path, stop_at_return=-1.0, keep_replay=True)
+    config, manifest = Config.load(path), whole(path)
+    assert has_ended(path, manifest, config)
+    assert not has_ended(path, manifest, dataclasses.replace(config, stop_at_return=None))
+    assert not has_ended(path, manifest, dataclasses.replace(config, steps=400))
+
+
+def test_an_error_of_an_environment_in_the_middle_is_said(tmp_path, monkeypatch):
+    step = Seed.step_env
+
+    def other(self, actions):
+        if len(self.replay) > 20:
+            raise ConfigError("--game: shows images of another shape")
+        return step(self, actions)
+
+    monkeypatch.setattr(Seed, "step_env", other)
+    with pytest.raises(ConfigError, match="another shape"):
+        train(tmp_path / "run")
+    assert ending.read(tmp_path / "run").status == "failed"
 
 
 def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):

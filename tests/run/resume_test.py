@@ -207,6 +207,19 @@ def test_a_return_that_ends_a_run_ends_it_all_the_same(tmp_path, monkeypatch, st
     assert rows(tmp_path / "run") == rows(tmp_path / "whole")
 
 
+def test_a_best_policy_of_after_the_checkpoint_goes(stopped, tmp_path):
+    """The run may not get there again; readers take the newest."""
+    config, path = stopped
+    run = shutil.copytree(path, tmp_path / "run")
+    (best,) = (run / "best").iterdir()
+    shutil.copytree(best, run / "best" / f"{73:09d}")
+    manifest = checkpoint.newest_good(run, pytest.fail)
+    resumed = make_run(config, run, resume=[manifest])
+    resumed.env_threads.shutdown()
+    assert manifest.env_steps == 72
+    assert [p.name for p in (run / "best").iterdir()] == [best.name]
+
+
 @pytest.mark.parametrize("steps", [104, 120])
 def test_a_finished_run_that_is_extended_is_the_run_that_was_longer(whole, tmp_path, steps):
     # After 120 env steps an evaluation is under way when the run ends.
@@ -251,7 +264,7 @@ OF_A_RUN = {
     "of the configuration": {
         "config", "checkpoint_every", "agent", "device", "schedules", "act_keys", "stop",
     },
-    "of the process": {"env_threads"},
+    "of the process": {"env_threads", "begun"},
 }  # fmt: skip
 OF_EVALUATIONS = {
     "in parts": {"under_way", "best", "recording"},

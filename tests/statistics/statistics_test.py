@@ -334,6 +334,9 @@ def test_the_interval_of_an_interquartile_mean_with_few_runs():
     assert found.high - point == pytest.approx(float(t_quantile(0.95, freedom)) * variances.sum() ** 0.5)
     assert estimate(interquartile_mean, scores[:, :4]).kind == statistics.NARROW  # of few games
     assert estimate(interquartile_mean, np.tile(scores, (4, 1))).kind == statistics.BOOTSTRAP  # of many runs
+    # Few runs of one arm decide for a difference.
+    difference = estimate_difference(scores, np.tile(scores, (4, 1)), interquartile_mean)
+    assert difference.kind == statistics.STRATIFIED and difference.low < 0 < difference.high
     # With other numbers of runs, too, the terms' mean is the interquartile mean, also under leading axes.
     games = {str(i): scores[None, : 2 + i % 2, i] * [[1.0], [-1.0]] for i in range(6)}
     assert mean(interquartile_terms(games)) == pytest.approx(interquartile_mean(games))

@@ -41,8 +41,13 @@ def test_a_number_of_a_file(tmp_path):
         ("a.json; share; .0k", "Unknown format|Invalid format"),
         ("campaign Catch joint", "expected CAMPAIGN GAME ARM BASELINE"),
         ("c G a b - c G a b - c G a b", "expected CAMPAIGN GAME ARM BASELINE"),
-        ("catch_weight Catch nobody rl_only_256", "catch_weight: nobody on Catch has no runs"),
-        ("catch_weight Catch rl_only_256 joint_256_weight10 8-10", r"no runs of the seeds \[10\]"),
+        ("catch_weight Catch rl_only_256 joint_256_weight10 a-b", "expected the seeds as FIRST-LAST"),
+        ("catch_weight+catch_weight Catch rl_only_256 joint_256_weight10", r"see \[5, 6, 7, 8, 9\]"),
+        ("catch_weight Catch nobody rl_only_256", "catch_weight: nobody on Catch has not one run"),
+        (
+            "catch_weight Catch rl_only_256 joint_256_weight10 8-10",
+            r"one run of each of its seeds, see \[10\]",
+        ),
     ],
 )
 def test_a_mark_that_means_nothing_is_an_error(tmp_path, what, said):
@@ -78,4 +83,5 @@ def test_every_figure_of_a_packed_campaign_is_drawn_again():
         "--games=Catch,CatchDistractor",
         "--seeds=10,11,12,13,14,15,16,17,18,19,",
     ]
+    assert len(answers.contents()) > 40
     assert set(answers.ANALYSES.values()) == set(found) - drawn

@@ -1,5 +1,6 @@
 """Tests of experiments.runs.collect."""
 
+import numpy as np
 import pytest
 
 from experiments.runs import collect
@@ -119,3 +120,15 @@ def test_other_protocols_are_refused_unless_forced(tmp_path, field, value):
         collect.check_protocols(runs)
     (line,) = collect.check_protocols(runs, force=True)
     assert f"{field} is {getattr(Config(), field)} there and {value} here" in line
+
+
+def test_arms_are_compared_where_all_of_them_have_curves():
+    """The same line, evaluated from 1,000 or from 2,500 env steps on: the same area, from 2,500 on."""
+    early = (np.arange(1000, 6000, 1000), np.arange(1, 6) / 5)
+    late = (np.array([2500, 5000]), np.array([0.5, 1.0]))
+    until, found = collect.ends({"early": [early, early], "late": [late]})
+    assert until == 5000 and found["late"]["area_under_curve"] == pytest.approx([0.75])
+    assert found["early"]["area_under_curve"] == pytest.approx([0.75, 0.75])
+    assert found["early"]["at_the_end"].tolist() == [1.0, 1.0]
+    with pytest.raises(ConfigError, match="one begins at 2,500, another ends at 2,000"):
+        collect.ends({"early": [(early[0][:2], early[1][:2])], "late": [late]})

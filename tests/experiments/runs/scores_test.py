@@ -264,3 +264,28 @@ def test_what_the_figure_runs():
     assert [arm.name for arm in figure.arms] == ["der", "spr_aug"]
     names = [run.name for run in figures.planned([figure], SUITES["signed"], [0, 1], {})]
     assert len(names) == 2 * 6 * 2 and names[0] == "Boxing/der/seed0"
+
+
+def test_games_of_different_protocols_are_not_aggregated_unless_forced(tmp_path):
+    finished(tmp_path / "Boxing/der/seed0", 1.0, 1.0, game="Boxing")
+    for seed in range(2):
+        values = {"game": "Pong", "sticky_actions": 0.25, "seed": seed}
+        finished(tmp_path / f"Pong/der/seed{seed}", 1.0, 1.0, **values)
+    with pytest.raises(ConfigError, match="another protocol than .*Boxing.*sticky_actions.*--force"):
+        evaluated(tmp_path)
+    found = evaluated(tmp_path, force=True)
+    assert len(found["forced"]) == 2 and "sticky_actions" in found["forced"][0]
+    differs = found["arms"]["der"]["differs"][RERUN]
+    assert (
+        differs.startswith("Boxing: ")
+        and "seeds 100 (here 1); Pong: sticky actions 0.0 (here 0.25)" in differs
+    )
+
+
+def test_where_a_run_was_resumed_is_said(runs):
+    path = runs / "Boxing/der/seed0/config.json"
+    about = json.loads(path.read_text()) | {"cores": 1, "git_revision": "a"}
+    about["continued"] = [{"changed": {"cores": 2, "git_revision": "b"}}]
+    path.write_text(json.dumps(about))
+    found = evaluated(runs)["arms"]["der"]
+    assert found["cores"] == [0, 1, 2] and found["revisions"] == ["None", "a", "b"]
