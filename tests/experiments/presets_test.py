@@ -84,7 +84,7 @@ def test_an_arm_is_what_its_name_says(name):
     features = "50" if name.endswith("_50") else "256"
     nature = name.endswith("nature")
     assert (encoder, options.get("features")) == (("nature", None) if nature else ("sac_ae", features))
-    # With the five choices that are needed by the rule of experiments/results/pong_choices.
+    # With the five choices of experiments/results/pong_choices.
     assert {"init": "he", "zero_sum": "true", "gain": "32"}.items() <= options.items()
     assert config.rl == "rainbow:init_std=1,priority=kl"
     assert config.augment == ("all" if name.endswith("_aug") else "none")
