@@ -163,14 +163,19 @@ def test_variance_and_covariance_of_vicreg_by_hand():
 
 def test_vicreg_weighs_its_terms_as_the_authors_code_does():
     """Twice the same latents: 2 of variance for the mean of both views, 3 of each view's covariance."""
+    encoder = make_encoder()
+    window, params = make_window(), helpers.random_params(encoder.init)
     objective = objectives.vicreg(
-        make_context(D), hidden=0, outputs=D, invariance=5.0, variance=2.0, covariance=3.0, view="none"
+        make_context(), hidden=0, outputs=3, invariance=5.0, variance=2.0, covariance=3.0, view="none"
     )
-    z = draw(1, BATCH, D)
-    losses, head, _ = loss_of(objective, latents_of(z), make_window())
-    expanded = z[0] @ np.asarray(head["Dense_0"]["kernel"]) + np.asarray(head["Dense_0"]["bias"])
-    expected = 2 * float(variance_loss(expanded)) + 6 * float(covariance_loss(expanded))
-    np.testing.assert_allclose(losses, expected, rtol=1e-5)
+    head = helpers.random_params(objective.init)
+    latents = make_latents(encoder, params, params, window)
+    losses, metrics = objective.loss(head, head, latents, window, jax.random.key(0))
+    (layer,) = head.values()
+    z = np.asarray(latents.online(0)) @ layer["kernel"] + layer["bias"]
+    expected = 2 * float(variance_loss(z)) + 6 * float(covariance_loss(z))
+    np.testing.assert_allclose(losses, expected, rtol=1e-4)
+    assert float(metrics["variance"]) == pytest.approx(float(variance_loss(z)), rel=1e-4)
 
 
 def test_barlows_correlation_is_numpys():
