@@ -58,12 +58,14 @@ def folders_below(root: Path) -> list[Path]:
     return runs_below(root, CONFIGS)
 
 
-def read(folder: Path, *, only_last: bool = False) -> list[RunData]:
+def read(folder: Path, *, only_last: bool = False, mend: bool = False) -> list[RunData]:
     """Reads packed runs, as `run_data.load_run` gives them from their directories.
 
     Args:
         folder: that they are packed in.
         only_last: whether to read the last row of each run alone, which is ten times as fast.
+        mend: whether to leave out rows of runs that configs.json does not have, of which it says so: an
+            addition was killed between the two files, the second of which is configs.json.
 
     Raises:
         ConfigError: a file cannot be read, or is not what `write` writes.
@@ -84,9 +86,10 @@ def read(folder: Path, *, only_last: bool = False) -> list[RunData]:
         check_rows(its, f"{folder / ROWS}: {run['path']}")
         runs.append(RunData(place, config.game, arm, config.seed, config, its, ended, about))
     if rows:
-        raise ConfigError(
-            f"{folder / ROWS}: rows of {_name(*next(iter(rows)))}, which {CONFIGS} does not have"
-        )
+        said = f"{folder / ROWS}: rows of {_name(*next(iter(rows)))}, which {CONFIGS} does not have"
+        if not mend:
+            raise ConfigError(f"{said}; packing the same runs again mends it")
+        display.say(f"{said}: left out")
     return runs
 
 
@@ -163,7 +166,7 @@ def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     found = [load_run(path) for path in run_directories(root)]
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
-    here = read(folder) if is_packed(folder) else []
+    here = read(folder, mend=True) if is_packed(folder) else []
     under_way = [run for run in found if not run.over or (run.ended and run.ended.status == "stopped")]
     whole = added([], (run for run in found if run not in under_way))
     runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))

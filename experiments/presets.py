@@ -19,8 +19,8 @@ _RECONSTRUCTION = "reconstruction:weight=1"
 _FORWARD = "forward_pixels:weight=1"
 _L2 = "latent_l2:weight=1e-6"
 
-# Five choices that a textbook agent does not make, and a decoder that starts near black. With all five Rainbow
-# begins to learn Pong within 20,000 updates, with none it does not: experiments/results/pong_choices.
+# Five choices that a textbook agent does not make, and a decoder that starts near black. With all five
+# Rainbow begins to learn Pong within 20,000 updates, with none it does not: experiments/results/pong_choices.
 _START = "init=he,zero_sum=true,gain=32,decoder_scale=0.1"
 _RAINBOW = "rainbow:init_std=1,priority=kl"
 _NATURE = f"nature:{_START}"

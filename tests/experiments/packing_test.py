@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from unittest import mock
 
 import pytest
 from absl import flags
@@ -251,3 +252,15 @@ def test_a_run_without_rows_is_read(tmp_path):
     (read,) = packing.read(tmp_path / "out")
     assert read.rows == [] and read.ended == NOT_FINITE
     assert packing.read(tmp_path / "out", only_last=True)[0].rows == []
+
+
+def test_an_addition_that_was_killed_between_its_files_is_made_again(root, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    packing.pack(write_run(tmp_path / "first/a/seed0", ended=Ending("finished", 100)).parents[1], out)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(packing, "replace_text", mock.Mock(side_effect=KeyboardInterrupt))
+        packing.pack(root, out)
+    with pytest.raises(ConfigError, match="configs.json does not have; packing the same runs again mends it"):
+        packing.read(out)
+    assert packing.pack(root, out) == (5, 6, [])
+    assert len(packing.read(out)) == 6
