@@ -60,8 +60,8 @@ class Seed:
         except (ValueError, MemoryError) as error:
             raise ConfigError(
                 f"--buffer_size={config.buffer_size}: {error}; --num_envs={config.num_envs}, "
-                f"--frame_stack={config.frame_stack} and a horizon of {agent.horizon}, the largest of --rl "
-                "and --objective, say how much it takes"
+                f"--frame_stack={config.frame_stack} and the {agent.horizon} steps ahead that "
+                f"--rl={config.rl.partition(':')[0]}:n_step= or --objective looks say how much it takes"
             ) from None
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
