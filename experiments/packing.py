@@ -167,12 +167,11 @@ def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
     here = read(folder, mend=True) if is_packed(folder) else []
-    under_way = [run for run in found if not run.over or (run.ended and run.ended.status == "stopped")]
-    whole = added([], (run for run in found if run not in under_way))
+    whole = added([], (run for run in found if run.over))
     runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
-    return len(runs) - len(here), len(runs), [run.path for run in under_way]
+    return len(runs) - len(here), len(runs), [run.path for run in found if not run.over]
 
 
 def unpack(folder: Path, root: Path) -> int:

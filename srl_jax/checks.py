@@ -3,6 +3,7 @@
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
+from srl_jax import specs
 from srl_jax.errors import ConfigError
 from srl_jax.learning import annealing
 from srl_jax.learning.modes import MODES, PROJECTING, Mode, both_train, of, ratios, two_optimizers
@@ -253,8 +254,18 @@ def check(
             f"--gate={config.gate}: with --encoder_optimizer=separate the second gradient is taken after "
             "RL's step, so that the two do not meet; give --encoder_optimizer=summed or simultaneous"
         )
+    _check_terminal(config)
     _check_ratios(config)
     return config
+
+
+def _check_terminal(config: "Config") -> None:
+    text = config.gamma_anneal
+    start = annealing.parse(text, float).start if text else config.gamma
+    if not min(start, config.gamma) and any(specs.split(x)[0] == "terminal" for x in config.objectives):
+        flag = f"gamma_anneal={text}" if config.gamma else "gamma=0"
+        why = "a discount of 0 is how --objective=terminal knows a terminal state"
+        raise ConfigError(f"--{flag}: {why}; give a gamma above 0")
 
 
 def _check_ratios(config: "Config") -> None:

@@ -50,12 +50,12 @@ class RunData(NamedTuple):
 
     @property
     def over(self) -> bool:
-        """Whether it says how it ended, or has all its env steps: earlier versions wrote no ended.json.
+        """Whether it has ended and was not stopped, or has all its env steps: earlier versions did not say.
 
         These had no final games, which a run with all its env steps may still be playing.
         """
         if self.ended is not None or self.config.final_games:
-            return self.ended is not None
+            return self.ended is not None and self.ended.status != "stopped"
         return bool(self.rows) and self.rows[-1]["env_steps"] >= self.config.steps
 
 

@@ -68,7 +68,7 @@ def end_score(run: RunData) -> tuple[Score | None, str]:
     if run.failed:
         return None, run.ended.reason
     done = max((row["env_steps"] for row in run.rows), default=0)
-    if run.ended.status != "finished" if run.ended else not run.over:
+    if not run.over:
         left = ", without its final games" if run.config.final_games and done >= run.config.steps else ""
         return None, f"not at its end: {done:,} of {run.config.steps:,} env steps{left}"
     for kind, games in (("final", "final/games"), ("eval", None)):

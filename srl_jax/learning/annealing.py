@@ -3,7 +3,6 @@
 import math
 from typing import TYPE_CHECKING, NamedTuple
 
-from srl_jax import specs
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Spec, parse_change, value_text
 
@@ -88,11 +87,6 @@ def check(config: "Config", mode: "Mode") -> None:
             raise ConfigError(
                 f"--{name}={text}: ends at --gamma, which is {config.gamma}; give --gamma={end}"
             )
-    start = parse(written(config.gamma_anneal, float), float).start if config.gamma_anneal else config.gamma
-    if not min(start, config.gamma) and any(specs.split(text)[0] == "terminal" for text in config.objectives):
-        flag = f"gamma_anneal={config.gamma_anneal}" if config.gamma else "gamma=0"
-        why = "a discount of 0 is how --objective=terminal knows a terminal state"
-        raise ConfigError(f"--{flag}: {why}; give a gamma above 0")
     if config.reset == "none":
         return
     if not config.reset_every:

@@ -19,14 +19,6 @@ def _panel(game, **lines):
     return plots.Panel(game, made, [plots.Level("Human", 9.0, "other protocol")])
 
 
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that would have been saved."""
-    figures = []
-    monkeypatch.setattr(plots, "save", lambda figure, path: figures.append(figure) or path)
-    return figures
-
-
 def test_every_game_has_a_panel_and_an_arm_one_colour(drawn, tmp_path):
     thesis = ([0, 150, 300], [1.0, 4.0, 10.0])
     panels = [_panel("Pong", a=(1.0, None), b=(2.0, thesis)), _panel("Catch", b=(5.0, None))]

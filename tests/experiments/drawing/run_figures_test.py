@@ -5,20 +5,12 @@ import json
 import numpy as np
 import pytest
 
-from experiments.drawing import plots, run_figures
+from experiments.drawing import run_figures
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
-
-
-@pytest.fixture
-def drawn(monkeypatch):
-    """The figures that would have been saved."""
-    figures = []
-    monkeypatch.setattr(plots, "save", lambda figure, path: figures.append(figure) or path)
-    return figures
 
 
 def eval_row(steps, returns):
