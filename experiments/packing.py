@@ -4,10 +4,12 @@ Two files take the place of a directory for each run. configs.json has a configu
 game, and what is each run's own. rows.jsonl.gz has the rows of all runs, each with its game, arm and seed:
 `pandas.read_json("rows.jsonl.gz", lines=True)`. Figures and reports read such a folder as they read run
 directories. Whatever else lies in the folder stays, and runs of other seeds, arms and games can be added
-later; a run that is under way is left out. `--unpack` makes the run directories again.
+later; a run that is under way is left out, and so is one that was stopped and could go on, but for `--stopped`.
+`--unpack` makes the run directories again.
 """
 
 import gzip
+import itertools
 import json
 import os
 import zlib
@@ -147,7 +149,7 @@ def added(here: Sequence[RunData], more: Iterable[RunData]) -> list[RunData]:
     return list(runs.values())
 
 
-def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
+def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, list[Path]]:
     """Adds the runs in or below a directory to those that are packed in a folder.
 
     A run that is under way, was stopped or killed is left out: it may still get other rows.
@@ -155,6 +157,7 @@ def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     Args:
         root: a run keeps its path below it.
         folder: made if it is not there.
+        stopped: whether to add runs that were stopped, too: nobody will resume them.
 
     Returns:
         How many runs were added, how many there are, and the directories of those that were left out.
@@ -167,11 +170,13 @@ def pack(root: Path, folder: Path) -> tuple[int, int, list[Path]]:
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
     here = read(folder, mend=True) if is_packed(folder) else []
-    whole = added([], (run for run in found if run.over))
+    ready = [run.over or (stopped and run.ended is not None) for run in found]
+    whole = added([], itertools.compress(found, ready))
     runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
-    return len(runs) - len(here), len(runs), [run.path for run in found if not run.over]
+    left_out = [run.path for run, is_ready in zip(found, ready, strict=True) if not is_ready]
+    return len(runs) - len(here), len(runs), left_out
 
 
 def unpack(folder: Path, root: Path) -> int:
@@ -267,6 +272,8 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_boolean(
         "unpack", False, "make the directories of the runs that are packed in --runs", flag_values=values
     )
+    text = "pack runs that were stopped, too, which nobody will resume"
+    flags.DEFINE_boolean("stopped", False, text, flag_values=values)
 
 
 def main(argv: list[str]) -> None:
@@ -285,7 +292,7 @@ def main(argv: list[str]) -> None:
         if FLAGS.unpack:
             print(f"{out}: {unpack(runs, out)} runs unpacked")
         else:
-            more, count, left_out = pack(runs, out)
+            more, count, left_out = pack(runs, out, stopped=FLAGS.stopped)
             for path in left_out:
                 display.say(f"{path}: left out: it is under way, or was stopped or killed and can be resumed")
             print(f"{out}: {more} runs added, {count} in all")

@@ -239,10 +239,11 @@ def test_the_command_line(root, tmp_path, monkeypatch, capsys):
     assert not (tmp_path / "new").exists()
 
 
-def test_a_run_that_was_stopped_is_packed_when_it_has_ended(tmp_path):
+def test_a_run_that_was_stopped_is_packed_when_it_has_ended_or_is_asked_for(tmp_path):
     run = write_run(tmp_path / "runs/Catch/a/seed0", (0, 1), ended=Ending("stopped", 100))
     write_run(tmp_path / "runs/Catch/a/seed1", (0, 1, 2), ended=Ending("finished", 200), seed=1)
     assert packing.pack(tmp_path / "runs", tmp_path / "out") == (1, 1, [run])
+    assert packing.pack(tmp_path / "runs", tmp_path / "out", stopped=True) == (1, 2, [])
 
 
 def test_a_run_without_rows_is_read(tmp_path):
