@@ -46,6 +46,9 @@ from .sweeping.plan import presets as matching
 
 FLAGS = flags.FLAGS
 
+TWO = 2
+"""So many runs are drawn themselves: their t interval is nine standard deviations wide to either side."""
+
 
 def planned(
     figures: Sequence[Figure], games: Sequence[str], seeds: Sequence[int], given: dict
@@ -196,13 +199,17 @@ def draw(figure: Figure, numbers: Mapping[str, Any], path: Path) -> Path:
             if (values := entry["arms"].get(arm.name)) is not None:
                 ends = (np.array(values[key], float) for key in ("mean", "low", "high"))
                 curve = plots.Curve(values["env_steps"], *ends)
-                lines.append(plots.Line(arm.name, curve, len(values["seeds"]), arm.thesis_curve(game)))
+                runs = values["runs"] if len(values["seeds"]) == TWO else ()
+                lines.append(plots.Line(arm.name, curve, len(values["seeds"]), arm.thesis_curve(game), runs))
         policies = [plots.Level(name, x["mean"], x["differs"]) for name, x in entry["policies"].items()]
         levels = [plots.Level(**level) for level in entry["published"]]
         panels.append(plots.Panel(game, lines, levels, policies))
-    kinds = {arm["kind"] for entry in numbers["games"].values() for arm in entry["arms"].values()}
-    kinds = ", ".join(sorted(kinds - {statistics.NONE}))
-    note = f"bands: 95 % intervals over seeds at each point, {kinds}" if kinds else "single seeds: no bands"
+    arms = [arm for entry in numbers["games"].values() for arm in entry["arms"].values()]
+    kinds = {arm["kind"] for arm in arms if len(arm["seeds"]) > TWO} - {statistics.NONE}
+    notes = [f"bands: 95 % intervals over seeds at each point, {', '.join(sorted(kinds))}"] if kinds else []
+    if any(len(arm["seeds"]) == TWO for arm in arms):
+        notes.append("thin: both runs of an arm of two")
+    note = "; ".join(notes) or "single seeds: no bands"
     if any(panel.policies for panel in panels):
         note += "; dash-dotted: policies that learn nothing"
     if numbers["forced"]:

@@ -4,8 +4,8 @@ Two files take the place of a directory for each run. configs.json has a configu
 game, and what is each run's own. rows.jsonl.gz has the rows of all runs, each with its game, arm and seed:
 `pandas.read_json("rows.jsonl.gz", lines=True)`. Figures and reports read such a folder as they read run
 directories. Whatever else lies in the folder stays, and runs of other seeds, arms and games can be added
-later; a run that is under way is left out, and so is one that was stopped and could go on, but for `--stopped`.
-`--unpack` makes the run directories again.
+later; a run that is under way is left out, and so is one that was stopped, which could be resumed, but for
+`--stopped`. `--unpack` makes the run directories again.
 """
 
 import gzip

@@ -47,12 +47,14 @@ class Line(NamedTuple):
         curve: may have no points.
         seeds: whose mean it is; 0 is not told. The band of fewer than two is no interval: it is shown whole.
         thesis: (env steps, returns) of the thesis' own curve, or None.
+        runs: values of single runs at the curve's steps, thin lines in place of its band; none for the band.
     """
 
     label: str
     curve: Curve
     seeds: int = 0
     thesis: tuple | None = None
+    runs: Sequence[Sequence[float]] = ()
 
 
 class Level(NamedTuple):
@@ -154,9 +156,12 @@ def _draw_panel(axes, panel: Panel, looks: Mapping[str, Style]) -> dict[str, Any
     lines = [line for line in panel.lines if len(line.curve.at)]
     end = max((max(line.curve.at) for line in lines), default=1) or 1
     handles = {}
-    for label, curve, seeds, thesis in lines:
+    for label, curve, seeds, thesis, runs in lines:
         colour, pattern = looks[label]
-        axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0)
+        if runs:
+            axes.plot(curve.at, np.transpose(runs), color=colour, linewidth=0.8, alpha=0.5)
+        else:
+            axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0)
         marker = "o" if len(curve.at) == 1 else ""
         (drawn,) = axes.plot(curve.at, curve.point, pattern, color=colour, linewidth=1.8, marker=marker)
         handles[f"{label} ({seeds} seed{'' if seeds == 1 else 's'})" if seeds else label] = drawn
@@ -176,7 +181,8 @@ def _draw_panel(axes, panel: Panel, looks: Mapping[str, Style]) -> dict[str, Any
     if panel.log and len(shown) and 0 < 5 * np.nanmin(shown) <= np.nanmax(shown):
         axes.set_yscale("log")
     elif np.isfinite(shown).any():
-        axes.set_ylim(*(panel.limits or heights([line.curve for line in lines], shown)))
+        curves = [line.curve._replace(low=(), high=()) if line.runs else line.curve for line in lines]
+        axes.set_ylim(*(panel.limits or heights(curves, shown)))
     levels(axes, {x.method: x.score for x in panel.policies}, panel.levels)
     return handles
 

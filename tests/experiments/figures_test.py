@@ -296,7 +296,12 @@ def test_policies_that_learn_nothing_are_in_the_json_and_drawn(runs, monkeypatch
     monkeypatch.setattr(plots, "draw_panels", lambda *values: given.extend(values))
     figures.draw(FIGURE, numbers, runs / "x.png")
     panels, _, _, note, _ = given
-    assert "intervals over seeds at each point, Student's t; dash-dotted: policies that learn nothing" in note
+    assert note.split("; ") == [
+        "bands: 95 % intervals over seeds at each point, Student's t",
+        "thin: both runs of an arm of two",
+        "dash-dotted: policies that learn nothing",
+    ]
+    assert [line.runs for line in panels[0].lines] == [numbers["games"]["Catch"]["arms"]["a"]["runs"], ()]
     levels = [(name, row.return_mean, "") for name, row in known.items()]
     assert [tuple(level) for level in panels[0].policies] == levels
 

@@ -57,6 +57,16 @@ def test_a_band_that_is_very_wide_does_not_make_the_lines_flat(drawn, tmp_path):
     assert drawn[0].axes[0].get_ylim() == pytest.approx((-2.3, 4.3))
 
 
+def test_runs_are_thin_lines_in_place_of_the_band(drawn, tmp_path):
+    curve = plots.Curve(STEPS, [0.0, 1.0, 2.0], [np.nan, -8.0, -7.0], [np.nan, 2.5, 11.0])
+    line = plots.Line("a", curve, 2, runs=[[0.0, 1.0, 1.0], [0.0, 1.0, 3.0]])
+    plots.draw_panels([plots.Panel("Pong", [line])], tmp_path / "x.png", "title")
+    axes = drawn[0].axes[0]
+    assert [list(x.get_ydata()) for x in axes.lines] == [[0, 1, 1], [0, 1, 3], [0, 1, 2]]
+    assert not axes.collections
+    assert axes.get_ylim() == pytest.approx((-0.15, 3.15))  # 5 % of the three to either side
+
+
 def test_policies_and_published_results_are_within_the_axis(drawn, tmp_path):
     line = plots.Line("a", plots.Curve(STEPS, [0.0, 1.0, 2.0], *[np.full(3, np.nan)] * 2), 1)
     panel = plots.Panel("Pong", [line], [plots.Level("Human", 20.0)], [plots.Level("random", -10.0)])
