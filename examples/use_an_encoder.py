@@ -76,5 +76,8 @@ def main(run: str, updates: int = 200) -> tuple[float, float]:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 2:
+        print("error: name a run: python examples/use_an_encoder.py runs/x", file=sys.stderr)
+        sys.exit(2)
     before, after = main(sys.argv[1])
     print(f"mean squared error of the values: {before:.3g} before, {after:.3g} after")

@@ -69,7 +69,9 @@ def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[
         collect.check_arms(runs)
         found += [members for arms in collect.grouped(runs).values() for members in arms.values()]
     if len(found) < 2:
-        raise ConfigError(f"--runs={roots[0]}: one curve; name a second run, or a folder of several")
+        raise ConfigError(
+            f"{roots[0]}: one curve; name a second run, or a folder of several; srl-jax draw draws one run"
+        )
     runs = [run for members in found for run in members]
     known = {name for run in runs for row in run.rows for name in row} - {*LEADING[:2]}
     if key not in known:

@@ -19,7 +19,7 @@ from srl_jax import envs
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
-from srl_jax.files.resuming import all_to_resume, blank, going_on, has_ended, is_run, say_anew
+from srl_jax.files.resuming import all_to_resume, blank, going_on, has_ended, is_run, say, say_anew
 from srl_jax.files.rundir import check_free, run_directory
 from srl_jax.training import check_game, check_sources, completed, resolved
 
@@ -225,6 +225,8 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     if not resume and not values["overwrite"].value:
         for directory, _ in runs:
             say_anew(directory)
+    if manifests[0]:
+        say(f"{path}: resumed from {manifests[0].env_steps:,} env steps")
     say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):

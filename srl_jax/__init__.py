@@ -2,7 +2,7 @@
 
     import srl_jax
 
-    result = srl_jax.train(srl_jax.Config(game="Catch", steps=20_000), "runs/x")
+    result = srl_jax.train(srl_jax.Config(game="Pong", steps=1_000_000), "runs/x")
     policy = srl_jax.load("runs/x")
     actions = policy.act(observations)  # uint8 [B, H, W, S * C] -> int32 [B]
 

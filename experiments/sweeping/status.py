@@ -1,4 +1,7 @@
-"""What one sees of a sweep: how far it is, how long it still takes, which arm did best. Imports no jax."""
+"""What one sees of a sweep: how far it is, how long it still takes, which arm did best.
+
+Imports jax only where no speed is known but that of published runs.
+"""
 
 import contextlib
 import functools
@@ -83,7 +86,7 @@ def rates(
     here = sums((entry.config, own[name]) for name, entry in entries.items())
     found: dict[str, float | None] = {}
     for name, (_, config) in entries.items():
-        like = here.get(alike(config)) or measured.get(alike(config)) or _published().get(alike(config))
+        like = here.get(alike(config)) or measured.get(alike(config)) or _published_like(config)
         found[name] = own[name].per_s if _timed(config, own[name]) else like and like[0] / like[1]
     return found
 
@@ -110,15 +113,32 @@ def sums(runs: Iterable[tuple[Config, Progress]]) -> Sums:
     return found
 
 
+def _published_like(config: Config) -> tuple[float, float] | None:
+    """Env steps and seconds of published runs that are alike; None where there are none."""
+    from srl_jax.training import completed
+
+    try:
+        return _published().get(alike(completed(config)))
+    except ConfigError:  # it has something of a plug-in
+        return None
+
+
 @functools.cache
 def _published() -> Sums:
-    """`sums` of the runs that the project has published."""
+    """`sums` of the runs that the project has published; options that are newer have their defaults."""
+    from srl_jax.training import completed
+
     runs: list[RunData] = []
     for folder in packing.folders_below(RESULTS):
         with contextlib.suppress(ConfigError):  # of an earlier version
             runs += packing.read(folder, only_last=True)
-    last = [(run.config, run.rows[-1]) for run in runs if run.rows]
-    return sums((config, Progress(row["env_steps"], row["wall_s"])) for config, row in last)
+    found = []
+    for run in runs:
+        if run.rows:
+            with contextlib.suppress(ConfigError):  # of an earlier version, or with something of a plug-in
+                last = run.rows[-1]
+                found.append((completed(run.config), Progress(last["env_steps"], last["wall_s"])))
+    return sums(found)
 
 
 def seconds_left(
@@ -260,10 +280,11 @@ def dry_run(
         arms.setdefault(name.rpartition("/")[0], []).append(name)
     rows = [("arm", "runs", "done", "to run", "env steps", "steps/s", "time")]
     for arm, names in arms.items():
-        todo, rate = [left[name] for name in names if name in left], per_s[names[0]]
-        times = ("unknown", "unknown") if rate is None else (f"{rate:,.0f}", hms(sum(todo) / rate))
+        todo = {name: left[name] for name in names if name in left}
+        steps, (taken, unknown) = sum(todo.values()), seconds_left(entries, todo, per_s, 1)
+        times = ("unknown", "unknown") if unknown else (f"{steps / taken:,.0f}" if taken else "-", hms(taken))
         counts = map(str, (len(names), len(names) - len(todo), len(todo)))
-        rows.append((arm, *counts, f"{sum(todo):,}", *times))
+        rows.append((arm, *counts, f"{steps:,}", *times))
     lines = columns(rows)
     lines += [f"{name}: {state.reason}; would wait" for name, state in found.items() if state.kind == "busy"]
     seconds, unknown = seconds_left(entries, left, per_s, workers)
@@ -276,7 +297,8 @@ def dry_run(
     if unknown:
         lines.append(
             "unknown: no run of this game's kind, encoder, losses and updates has been timed, here or "
-            "among published ones; start the sweep, and a few minutes later --status says how long it takes"
+            f"among published ones; a few minutes after the start, srl-jax sweep --out={root} --status says "
+            "how long it takes"
         )
     return lines
 

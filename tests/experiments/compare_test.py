@@ -133,8 +133,8 @@ def test_packed_runs_and_folders_of_arms_are_read_alike(runs, tmp_path, capsys):
     ("arguments", "message"),
     [
         ((), "--runs: missing; name two"),
-        (("a",), "--runs=.*a: one curve; name a second run"),
-        (("a", "a/"), "--runs=.*a: one curve; name a second run"),
+        (("a",), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
+        (("a", "a/"), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
         (("a", "nothing"), "nothing: no run directory there"),
         (("a", "b", "--key=eval/return_men"), "no run has it; there are eval/return_mean"),
         (("a", "c", "--key=text"), "c: text is not a number in each row"),

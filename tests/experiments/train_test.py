@@ -111,6 +111,7 @@ def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
     made = checkpoint_of(out, 200)
     (out / "metrics.jsonl").write_text("kept")
     assert train_in_process(*resume) == 0
+    assert capsys.readouterr().err == f"resume: {out}: resumed from 200 env steps\n"
     assert loop.resumed == [None, None, made]
     assert (out / "metrics.jsonl").read_text() == "kept" and made == checkpoint.read_manifest(out)
     assert not (out / "lock").exists()
@@ -173,7 +174,8 @@ def test_a_run_goes_on_without_the_one_that_it_started_from(capsys, loop, tmp_pa
         assert train_in_process(*frozen, f"--encoder_from={source}") == 0
         assert loop.resumed[-1] == made
         said = capsys.readouterr().err
-        assert ("neither is read any more" in said) == (source != pre) and said.count("\n") <= 1
+        assert ("neither is read any more" in said) == (source != pre)
+        assert said.endswith("resumed from 200 env steps\n") and said.count("\n") <= 2
     # What has to begin needs it.
     line = refused(
         capsys, *CATCH[1:], "--mode=frozen", f"--encoder_from={pre}", "--resume=auto", f"--out={tmp_path}/new"
@@ -223,6 +225,7 @@ def test_seeds_go_on_together(capsys, loop, tmp_path):
     for seed, env_steps in ((4, 100), (0, 100), (4, 200)):
         checkpoint_of(tmp_path / "runs" / f"seed{seed}", env_steps)
     train_in_process(*arguments, "--seeds=4,0")
+    assert capsys.readouterr().err == f"resume: {tmp_path}/runs: resumed from 100 env steps\n"
     assert loop.seeds == [[4, 0]] * 2
     assert [m and m.env_steps for m in loop.resumed] == [None, None, 100, 100]
     line = refused(capsys, *arguments[1:], "--seeds=4,0,1")
