@@ -119,7 +119,7 @@ def located(text: str, flag: str = "import") -> str:
         return str(here) if here.is_file() else text
     if path.suffix != ".py":
         raise ConfigError(f"--{flag}={text}: must be a file that ends in .py, or a module's name")
-    return str(_checked(str(path), flag))
+    return str(_checked(str(path), flag, f"no such file in {path.parent}"))
 
 
 def load(imports: Iterable[str]) -> None:
@@ -139,7 +139,8 @@ def imported(text: str, flag: str = "import") -> ModuleType:
         ConfigError: it is missing, lies in a run directory, or raises an error; one line that names it.
     """
     if text not in _LOADED:
-        path = _checked(text, flag) if _is_path(text) else None
+        moved = f"no such file; --{flag}=PATH says where it lies now"
+        path = _checked(text, flag, moved) if _is_path(text) else None
         try:
             _LOADED[text] = _import_file(path) if path else importlib.import_module(text)
         except (Exception, SystemExit) as error:
@@ -154,7 +155,12 @@ def _is_path(text: str) -> bool:
     return "/" in text or os.sep in text or text.endswith(".py")
 
 
-def _checked(text: str, flag: str) -> Path:
+def _checked(text: str, flag: str, missing: str) -> Path:
+    Args:
+        text: the path.
+        flag: that it came from.
+        missing: what is said where there is no such file.
+
     """The path of a file that may be imported.
 
     Raises:
@@ -162,7 +168,7 @@ def _checked(text: str, flag: str) -> Path:
     """
     path = Path(text)
     if not path.is_file():
-        raise ConfigError(f"--{flag}={text}: no such file; --{flag}=PATH says where it lies now")
+        raise ConfigError(f"--{flag}={text}: {missing}")
     for folder in path.resolve().parents:
         if (folder / "config.json").exists() and (folder / "metrics.jsonl").exists():
             raise ConfigError(
