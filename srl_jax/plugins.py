@@ -69,15 +69,15 @@ class Registry(dict[str, Callable]):
             option_defaults(factory)
         except (TypeError, ValueError) as error:
             raise ConfigError(f"srl_jax.{self.kind} takes no row {name!r}: {error}") from None
-        origin = _origin(factory)
+        file = origin(factory)
         # A module that is imported a second time, by another name, says the same again.
-        if name in self._reserved or (super().__contains__(name) and self._origins.get(name) != origin):
+        if name in self._reserved or (super().__contains__(name) and self._origins.get(name) != file):
             whose = self._origins.get(name, "the package itself")
             raise ConfigError(
-                f"{origin} registers {name!r} in srl_jax.{self.kind}, where {whose} has a row of that name; "
+                f"{file} registers {name!r} in srl_jax.{self.kind}, where {whose} has a row of that name; "
                 "choose another one"
             )
-        self[name], self._origins[name] = factory, origin
+        self[name], self._origins[name] = factory, file
         return factory
 
     def __contains__(self, name: object) -> bool:
@@ -97,9 +97,7 @@ class Registry(dict[str, Callable]):
             try:
                 self.register(name, point.load())
             except Exception as error:
-                raise ConfigError(
-                    f"{name!r} of {group}, the entry point {value}: {_reason(error)}"
-                ) from error
+                raise ConfigError(f"{name!r} of {group}, the entry point {value}: {reason(error)}") from error
         return bool(found)
 
 
@@ -144,7 +142,7 @@ def imported(text: str, flag: str = "import") -> ModuleType:
         try:
             _LOADED[text] = _import_file(path) if path else importlib.import_module(text)
         except (Exception, SystemExit) as error:
-            raise ConfigError(f"--{flag}={text}: {_reason(error, path)}") from error
+            raise ConfigError(f"--{flag}={text}: {reason(error, path)}") from error
     return _LOADED[text]
 
 
@@ -156,12 +154,12 @@ def _is_path(text: str) -> bool:
 
 
 def _checked(text: str, flag: str, missing: str) -> Path:
+    """The path of a file that may be imported.
+
     Args:
         text: the path.
         flag: that it came from.
         missing: what is said where there is no such file.
-
-    """The path of a file that may be imported.
 
     Raises:
         ConfigError: there is none, or it lies in a run directory, which may be somebody else's.
@@ -195,8 +193,8 @@ def _import_file(path: Path) -> ModuleType:
     return module
 
 
-def _reason(error: BaseException, path: Path | None = None) -> str:
-    """An error in a line, with the line of the file that it comes from."""
+def reason(error: BaseException, path: Path | None = None) -> str:
+    """An error in a line, after the line of the file, if one is named, that it comes from."""
     lines = [
         frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
     ]
@@ -206,8 +204,8 @@ def _reason(error: BaseException, path: Path | None = None) -> str:
     return " ".join(f"{f'line {lines[-1]}: ' if lines else ''}{what}".split())
 
 
-def _origin(factory: Any) -> str:
-    """The file in which a factory is written, or its module where that is not known."""
+def origin(factory: Any) -> str:
+    """The file in which a function is written, or its module where that is not known."""
     while isinstance(factory, functools.partial):
         factory = factory.func
     code = getattr(factory, "__code__", None)

@@ -281,6 +281,13 @@ def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path, 
         _train(*FLAGS, f"--out={tmp_path}/other")
 
 
+def test_a_loss_that_is_wrong_is_refused_before_the_first_step(tmp_path, fresh):
+    (tmp_path / "mine.py").write_text(MINE.replace("latents.online(0)), -1)", "latents.online(0)))"))
+    with pytest.raises(ConfigError, match=r"^--objective=smallness: its losses have shape \(\)"):
+        _train(f"--import={tmp_path}/mine.py", *FLAGS, f"--out={tmp_path}/run")
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_sweep_gives_its_runs_what_they_import(tmp_path):
     # Processes: that they are given it is the point. The run ends before its first update.
     (tmp_path / "mine.py").write_text(MINE)
