@@ -117,7 +117,7 @@ def located(text: str, flag: str = "import") -> str:
         return str(here) if here.is_file() else text
     if path.suffix != ".py":
         raise ConfigError(f"--{flag}={text}: must be a file that ends in .py, or a module's name")
-    return str(_checked(str(path), flag, f"no such file in {path.parent}"))
+    return str(_checked(str(path), flag, "no such file"))
 
 
 def load(imports: Iterable[str]) -> None:
