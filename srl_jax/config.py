@@ -345,7 +345,9 @@ class Config:
 
     def save(self, run: str | Path) -> None:
         """Writes a run's config.json: the fields, what made the run, and when it began (UTC)."""
-        write(run, {**dataclasses.asdict(self), **provenance.made_by(), "started": provenance.now()})
+        write(
+            run, {**dataclasses.asdict(self), **provenance.made_by(self.imports), "started": provenance.now()}
+        )
 
 
 def read(run: str | Path) -> tuple[Config, dict[str, Any]]:

@@ -141,9 +141,9 @@ def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) 
     if Path(path).suffix == ".npz":
         raise ConfigError(f"{path}: an exported encoder is read by srl_jax.encoders.from_npz")
     manifest = checkpoint.read_manifest(Path(path))
-    plugins.load(map(plugins.located, manifest.config.imports if imports is None else imports))
+    plugins.load(manifest.config.imports if imports is None else map(plugins.located, imports))
     try:
-        agent = make_agent(manifest.config, manifest.frame_shape, manifest.num_actions)
+        agent = make_agent(manifest.config, manifest.frame_shape, manifest.num_actions, trained=False)
         template = agent.shapes().params
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{manifest.path}: {error}") from None

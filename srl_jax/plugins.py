@@ -69,15 +69,15 @@ class Registry(dict[str, Callable]):
             option_defaults(factory)
         except (TypeError, ValueError) as error:
             raise ConfigError(f"srl_jax.{self.kind} takes no row {name!r}: {error}") from None
-        origin = _origin(factory)
+        file = origin(factory)
         # A module that is imported a second time, by another name, says the same again.
-        if name in self._reserved or (super().__contains__(name) and self._origins.get(name) != origin):
+        if name in self._reserved or (super().__contains__(name) and self._origins.get(name) != file):
             whose = self._origins.get(name, "the package itself")
             raise ConfigError(
-                f"{origin} registers {name!r} in srl_jax.{self.kind}, where {whose} has a row of that name; "
+                f"{file} registers {name!r} in srl_jax.{self.kind}, where {whose} has a row of that name; "
                 "choose another one"
             )
-        self[name], self._origins[name] = factory, origin
+        self[name], self._origins[name] = factory, file
         return factory
 
     def __contains__(self, name: object) -> bool:
@@ -97,9 +97,7 @@ class Registry(dict[str, Callable]):
             try:
                 self.register(name, point.load())
             except Exception as error:
-                raise ConfigError(
-                    f"{name!r} of {group}, the entry point {value}: {_reason(error)}"
-                ) from error
+                raise ConfigError(f"{name!r} of {group}, the entry point {value}: {reason(error)}") from error
         return bool(found)
 
 
@@ -119,7 +117,7 @@ def located(text: str, flag: str = "import") -> str:
         return str(here) if here.is_file() else text
     if path.suffix != ".py":
         raise ConfigError(f"--{flag}={text}: must be a file that ends in .py, or a module's name")
-    return str(_checked(str(path), flag))
+    return str(_checked(str(path), flag, "no such file"))
 
 
 def load(imports: Iterable[str]) -> None:
@@ -139,11 +137,12 @@ def imported(text: str, flag: str = "import") -> ModuleType:
         ConfigError: it is missing, lies in a run directory, or raises an error; one line that names it.
     """
     if text not in _LOADED:
-        path = _checked(text, flag) if _is_path(text) else None
+        moved = f"no such file; --{flag}=PATH says where it lies now"
+        path = _checked(text, flag, moved) if _is_path(text) else None
         try:
             _LOADED[text] = _import_file(path) if path else importlib.import_module(text)
         except (Exception, SystemExit) as error:
-            raise ConfigError(f"--{flag}={text}: {_reason(error, path)}") from error
+            raise ConfigError(f"--{flag}={text}: {reason(error, path)}") from error
     return _LOADED[text]
 
 
@@ -154,15 +153,20 @@ def _is_path(text: str) -> bool:
     return "/" in text or os.sep in text or text.endswith(".py")
 
 
-def _checked(text: str, flag: str) -> Path:
+def _checked(text: str, flag: str, missing: str) -> Path:
     """The path of a file that may be imported.
+
+    Args:
+        text: the path.
+        flag: that it came from.
+        missing: what is said where there is no such file.
 
     Raises:
         ConfigError: there is none, or it lies in a run directory, which may be somebody else's.
     """
     path = Path(text)
     if not path.is_file():
-        raise ConfigError(f"--{flag}={text}: no such file; --{flag}=PATH says where it lies now")
+        raise ConfigError(f"--{flag}={text}: {missing}")
     for folder in path.resolve().parents:
         if (folder / "config.json").exists() and (folder / "metrics.jsonl").exists():
             raise ConfigError(
@@ -189,8 +193,8 @@ def _import_file(path: Path) -> ModuleType:
     return module
 
 
-def _reason(error: BaseException, path: Path | None = None) -> str:
-    """An error in a line, with the line of the file that it comes from."""
+def reason(error: BaseException, path: Path | None = None) -> str:
+    """An error in a line, after the line of the file, if one is named, that it comes from."""
     lines = [
         frame.lineno for frame in traceback.extract_tb(error.__traceback__) if frame.filename == str(path)
     ]
@@ -200,8 +204,8 @@ def _reason(error: BaseException, path: Path | None = None) -> str:
     return " ".join(f"{f'line {lines[-1]}: ' if lines else ''}{what}".split())
 
 
-def _origin(factory: Any) -> str:
-    """The file in which a factory is written, or its module where that is not known."""
+def origin(factory: Any) -> str:
+    """The file in which a function is written, or its module where that is not known."""
     while isinstance(factory, functools.partial):
         factory = factory.func
     code = getattr(factory, "__code__", None)

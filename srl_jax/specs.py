@@ -395,7 +395,9 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
     except SpecError as error:
         raise SpecError(f"{where}: {error}") from None
     if name not in registry:
-        raise SpecError(f"{where}: no {name!r}; {choices_text(name, registry)}")
+        raise SpecError(
+            f"{where}: no {name!r}; {choices_text(name, registry)}; --import=FILE.py registers your own"
+        )
     defaults = option_defaults(registry[name])
     options: dict[str, Any] = {}
     for key, value in texts.items():

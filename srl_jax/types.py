@@ -178,6 +178,9 @@ class Latents(NamedTuple):
     so are the offsets that two different lists share: what one objective asks for never changes the
     roundings of what another one sees.
 
+    An objective without a slow copy of the encoder has the online encoder's latents as slow ones, without
+    gradient.
+
     `of(window)` are the latents of another window under the same encoders: of a view of this one, say, that
     an objective has drawn with its own key. What it encodes is nobody else's.
     """

@@ -12,9 +12,15 @@ def observation(window: Window, k: int | Array) -> jax.Array:
     Args:
         window: its frames are [B, S + K, H, W, C].
         k: an offset in 0..K, an int for all rows or int32 [B], one for each.
+
+    Raises:
+        ValueError: an int is no offset of the window.
     """
-    size = window.frames.shape[1] - window.actions.shape[1]
+    horizon = window.actions.shape[1]
+    size = window.frames.shape[1] - horizon
     if isinstance(k, int):
+        if not 0 <= k <= horizon:
+            raise ValueError(f"offset {k} is not in 0..{horizon}, where {horizon} is the horizon")
         frames = window.frames[:, k : k + size]
     else:
         take = lambda row, start: jax.lax.dynamic_slice_in_dim(row, start, size)  # noqa: E731

@@ -148,8 +148,9 @@ def test_a_file_is_kept_with_its_absolute_path_and_a_module_with_its_name(tmp_pa
     for text in ("mine.py", "./mine.py", "mine", str(tmp_path / "mine.py")):
         assert located(text) == str(tmp_path / "mine.py")
     assert located("json.decoder") == "json.decoder"
-    with pytest.raises(ConfigError, match="--import=other.py|no such file"):
-        located("other.py")
+    with pytest.raises(ConfigError) as error:
+        located("other.py")  # nothing has moved: it has just been typed
+    assert str(error.value) == f"--import={tmp_path}/other.py: no such file"
     with pytest.raises(ConfigError, match="--import=./mine: must be a file that ends in .py"):
         located("./mine")
 
@@ -274,8 +275,17 @@ def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path, 
     assert [row["env_steps"] for row in read_metrics(run / "metrics.jsonl")][-1] == 120
     # Without it, the name is unknown.
     fresh()
-    with pytest.raises(ConfigError, match="no 'smallness'; .*valid: reconstruction,"):
+    with pytest.raises(
+        ConfigError, match="no 'smallness'; .*valid: reconstruction,.*; --import=FILE.py registers your"
+    ):
         _train(*FLAGS, f"--out={tmp_path}/other")
+
+
+def test_a_loss_that_is_wrong_is_refused_before_the_first_step(tmp_path, fresh):
+    (tmp_path / "mine.py").write_text(MINE.replace("latents.online(0)), -1)", "latents.online(0)))"))
+    with pytest.raises(ConfigError, match=r"^--objective=smallness: its losses have shape \(\)"):
+        _train(f"--import={tmp_path}/mine.py", *FLAGS, f"--out={tmp_path}/run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_sweep_gives_its_runs_what_they_import(tmp_path):

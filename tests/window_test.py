@@ -2,6 +2,7 @@
 
 import jax
 import numpy as np
+import pytest
 
 from srl_jax.window import image, observation, only, stack_last
 from tests.helpers import STACK, make_window
@@ -28,6 +29,12 @@ def test_observation_at_an_offset_by_hand():
     assert seen.shape == (2, 2, 2, STACK) and seen.dtype == np.uint8
     np.testing.assert_array_equal(seen[0, 1, 0], [0, 1, 2, 3])
     np.testing.assert_array_equal(observation(numbered(), 2)[1, 0, 1], [12, 13, 14, 15])
+
+
+@pytest.mark.parametrize("k", [-1, 4])
+def test_an_offset_beyond_the_window_is_refused(k):
+    with pytest.raises(ValueError, match=rf"^offset {k} is not in 0\.\.3, where 3 is the horizon$"):
+        observation(numbered(), k)
 
 
 def test_observation_at_an_offset_of_its_own_for_each_row():

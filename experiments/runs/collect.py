@@ -15,6 +15,7 @@ from srl_jax import checks, specs, statistics
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.data import Published, ReferencePolicy
 from srl_jax.errors import ConfigError
+from srl_jax.files import display, provenance
 from srl_jax.learning.modes import MODES
 
 from .. import packing
@@ -236,18 +237,48 @@ def left_out_text(arm: str, whys: Mapping[int, str], seeds: int) -> str:
 def check_arms(runs: Sequence[RunData]) -> None:
     """Whether runs of one arm and game differ in nothing but their seed and where its encoder comes from.
 
+    Says of an arm whose files of --import were not the same all the time.
+
     Raises:
         ConfigError: two differ in more; says in what.
     """
     names = [name for name in INFOS if name not in OF_A_SEED]
     for game, arms in grouped(runs).items():
         for arm, members in arms.items():
+            for line in _other_files(members):
+                display.say(f"{arm} on {game}: {line}")
             for run in members[1:]:
                 one, other = (checks.run_of(x.config).in_force() for x in (members[0], run))
                 if differing := difference(one, other, names):
                     raise ConfigError(
                         f"{run.path}: of the same arm, {arm} on {game}, as {members[0].path}, but {differing}"
                     )
+
+
+def history(run: RunData) -> dict[str, list[Any]]:
+    """What made a run, as `srl_jax.files.provenance.history` gives it.
+
+    Raises:
+        ConfigError: config.json does not say it as training writes it.
+    """
+    try:
+        return provenance.history(run.about)
+    except ValueError as error:
+        raise ConfigError(f"{run.path}: {error}") from None
+
+
+def _other_files(runs: Iterable[RunData]) -> Iterator[str]:
+    """A line for each file of --import that was not the same in all of an arm's runs, or while one ran."""
+    found: dict[str, dict[str, list[str]]] = {}
+    for run in runs:
+        past = history(run)
+        for name in filter(provenance.is_file, past):
+            sums = ", then ".join(str(x)[:10] for x in past[name])
+            found.setdefault(name, {}).setdefault(sums, []).append(str(run.seed))
+    for name, seeds in found.items():
+        if len(seeds) > 1 or ", then " in next(iter(seeds)):
+            texts = [f"sha256 {sums} (seed {', '.join(those)})" for sums, those in seeds.items()]
+            yield f"the imported {name} was not the same in all runs: {'; '.join(texts)}"
 
 
 def check_protocols(

@@ -10,8 +10,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from srl_jax import data, envs, statistics
-from srl_jax.errors import ConfigError
-from srl_jax.files import provenance
 
 from . import collect
 from .json_values import limits, plain
@@ -167,10 +165,7 @@ def evaluated(
 
 def _all(run: RunData, field: str) -> list[Any]:
     """What a run says of where and by what it ran, at its start and wherever it was resumed."""
-    try:
-        return provenance.history(run.about).get(field) or [None]
-    except ValueError as error:
-        raise ConfigError(f"{run.path}: {error}") from None
+    return collect.history(run).get(field) or [None]
 
 
 def _published(name: str, games: Sequence[str], common: Sequence[str]) -> dict[str, Any]:

@@ -1,30 +1,36 @@
-"""What made a run: versions of packages, the commit, what XLA was told, the machine. Imports no jax.
+"""What made a run: versions of packages, the commit, files of --import, what XLA was told, the machine.
 
 A run's config.json says it beside the settings, and under "continued" what was another one when the run was
-resumed.
+resumed. Imports no jax.
 """
 
+import contextlib
+import hashlib
 import importlib.metadata
 import os
 import platform
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 PACKAGES = (
     "srl-jax", "jax", "jaxlib", "flax", "optax", "chex", "numpy", "gymnasium", "absl-py", "ale-py",
 )  # fmt: skip
-MADE_BY = ("versions", "git_revision", "environment", "cpus", "cores")
+MADE_BY = ("versions", "git_revision", "environment", "cpus", "cores", "imported")
 """The keys of `made_by`."""
 ABOUT = (*MADE_BY, "started", "continued")
 """What config.json holds beside the fields of Config."""
 
 
-def made_by() -> dict[str, Any]:
-    """What config.json says of this process: software, how many CPUs there are, and how many for it."""
-    values = versions(), git_revision(), told_to_xla(), os.cpu_count(), cores()
+def made_by(imports: Iterable[str] = ()) -> dict[str, Any]:
+    """What config.json says of this process: software, how many CPUs there are, and how many for it.
+
+    Args:
+        imports: files and modules that the run imports, as of `srl_jax.config.Config`.
+    """
+    values = versions(), git_revision(), told_to_xla(), os.cpu_count(), cores(), sums(imports)
     return dict(zip(MADE_BY, values, strict=True))
 
 
@@ -34,13 +40,31 @@ def cores() -> int | None:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
 
 
+def is_file(name: str) -> bool:
+    """Whether what is imported, or a name of `history`, is a file and no module or package."""
+    return name.endswith(".py")
+
+
+def sums(imports: Iterable[str]) -> dict[str, str]:
+    """{name of a file, wherever it lies: its sha256} of what is imported; of modules nothing is said.
+
+    Files of one name have one sum, of all their content. What is not there is left out.
+    """
+    found: dict[str, Any] = {}
+    for path in map(Path, filter(is_file, imports)):
+        with contextlib.suppress(OSError):
+            content = path.read_bytes()
+            found.setdefault(path.name, hashlib.sha256()).update(content)
+    return {name: found[name].hexdigest() for name in found}
+
+
 def now() -> str:
     """The time, UTC."""
     return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime())
 
 
 def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What made a run: {what: its values, oldest first}, of packages, environment variables, and the rest.
+    """What made a run: {what: its values, oldest first}, of packages, environment variables, files, the rest.
 
     Args:
         about: the content of config.json. What it does not say at all is left out.
@@ -58,10 +82,15 @@ def history(about: Mapping[str, Any]) -> dict[str, list[Any]]:
     return found
 
 
-def changes(about: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """What is different now of what made a run: {name: (then, now)}, as of `history`; None for nothing."""
+def changes(about: Mapping[str, Any], imports: Iterable[str]) -> dict[str, tuple[Any, Any]]:
+    """What is different now of what made a run: {name: (then, now)}, as of `history`; None for nothing.
+
+    Args:
+        about: the content of config.json.
+        imports: what the run imports now.
+    """
     then = {name: values[-1] for name, values in history(about).items()}
-    here = _flat({name: value for name, value in made_by().items() if name in about})
+    here = _flat({name: value for name, value in made_by(imports).items() if name in about})
     pairs = {name: (then.get(name), here.get(name)) for name in {**then, **here}}
     return {name: pair for name, pair in pairs.items() if pair[0] != pair[1]}
 

@@ -158,7 +158,7 @@ def _say_changes(path: Path, there: Config, about: dict, wanted: Config) -> None
         if then != now:
             how = "the run resumes with the latter" if flag == "policy_from" else "neither is read any more"
             say(f"{path}: --{flag} was {then} and is {now}: {how}")
-    if changed := _changes(path, about):
+    if changed := _changes(path, about, wanted):
         what = ", ".join(
             f"{name} was {then!r:.200} and is {now!r:.200}" for name, (then, now) in changed.items()
         )
@@ -175,10 +175,10 @@ def _by_the_end(wanted: Config) -> str:
     return f"; {' and '.join(found)}" if found else ""
 
 
-def _changes(path: Path, about: dict) -> dict[str, tuple]:
-    """`srl_jax.files.provenance.changes` of a run directory's config.json."""
+def _changes(path: Path, about: dict, wanted: Config) -> dict[str, tuple]:
+    """`srl_jax.files.provenance.changes` of a run directory's config.json, for what is wanted of the run."""
     try:
-        return provenance.changes(about)
+        return provenance.changes(about, wanted.imports)
     except ValueError as error:
         raise ConfigError(f"{path / config.FILE}: {error}") from None
 
@@ -203,7 +203,7 @@ def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[None]:
         there, about = config.read(path)
         values = {name: getattr(resumed, name) for name in MAY_CHANGE}
         settings = {name: value for name, value in values.items() if getattr(there, name) != value}
-        changed = {name: now for name, (_, now) in _changes(path, about).items()}
+        changed = {name: now for name, (_, now) in _changes(path, about, resumed).items()}
         if settings or changed:
             now = {"env_steps": manifest.env_steps, "started": provenance.now()}
             continued = [*about.get("continued", []), {**now, "changed": changed, "settings": settings}]

@@ -1,18 +1,22 @@
 """Builds an agent from a configuration: encoder, objectives, jitted functions that init, update and act."""
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.typing import ArrayLike
 
-from srl_jax import encoders, objectives, rl, specs
+from srl_jax import encoders, objectives, plugins, rl, specs
 from srl_jax.augment import Views
 from srl_jax.config import Config
 from srl_jax.diagnostics.functions import Functions, make_functions
+from srl_jax.errors import ConfigError
+from srl_jax.latents import make_losses
 from srl_jax.learning import modes
 from srl_jax.learning.modes import Mode, encoder_learning_rate, second_learning_rate
 from srl_jax.learning.optim import ENCODER, RL, make_optimizer
@@ -28,7 +32,7 @@ from srl_jax.learning.update import (
 )
 from srl_jax.learning.weights import make_norms
 from srl_jax.rl import Algorithm
-from srl_jax.types import Array, Context, Encoder, Objective, Params, TrainState, Window
+from srl_jax.types import Array, Context, Encoder, Latents, Objective, Params, TrainState, Window
 
 
 class Init(Protocol):
@@ -178,16 +182,84 @@ def components(
     return encoder, algorithm, terms
 
 
-def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: int) -> Agent:
+def check_losses(agent: Agent, config: Config, frame_shape: tuple[int, int, int]) -> None:
+    """Whether each loss can be computed and gives what `Objective.loss` says. Compiles nothing.
+
+    Each one sees a window of its own horizon, though another objective may make the run's windows longer.
+
+    Args:
+        agent: of the configuration.
+        config, frame_shape: see `make_agent`.
+
+    Raises:
+        ConfigError: one does not; a line that names the objective, and the line of its file where it raises.
+    """
+    state, views = agent.shapes(), Views.of(config)
+
+    def rows(dtype: Any, *shape: int) -> Any:
+        return jax.ShapeDtypeStruct((config.batch_size, *shape), dtype)
+
+    for name, term in agent.objectives.items():
+        ahead = max(1, term.horizon)
+        numbers = rows(np.float32, ahead)
+        window = Window(
+            frames=rows(np.uint8, config.frame_stack + ahead, *frame_shape),
+            actions=rows(np.int32, ahead),
+            rewards=numbers,
+            discounts=numbers,
+            valid=numbers,
+            weight=rows(np.float32),
+        )
+        checked = term._replace(loss=_checked(term.loss, {"td_error"} if name == RL else set()))
+        losses_of = make_losses(agent.encoder, {name: checked}, agent.mode, views=views)
+        try:
+            jax.eval_shape(losses_of, state.params, state, window)
+        except Exception as error:
+            flag = f"rl={specs.split(config.rl)[0]}" if name == RL else f"objective={name}"
+            why = plugins.reason(error, Path(plugins.origin(term.loss)))
+            raise ConfigError(f"--{flag}: {why}") from error
+
+
+def _checked(loss: Callable, of_rows: Collection[str]) -> Callable:
+    """The same loss, which raises ConfigError where its results have other shapes than it may give.
+
+    Args:
+        loss: of an `Objective`.
+        of_rows: the metrics that may have more axes than a scalar.
+    """
+
+    def checked(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
+        found = loss(head, slow_head, latents, window, key)
+        if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Mapping)):
+            raise ConfigError("its loss must give two things: losses [B], and a dict of metrics, {} for none")
+        losses, metrics = found
+        batch = window.actions.shape[:1]
+        if np.shape(losses) != batch:
+            raise ConfigError(
+                f"its losses have shape {np.shape(losses)}; there is one of each row of the batch, {batch}"
+            )
+        for name, value in metrics.items():
+            if np.shape(value) and name not in of_rows:
+                raise ConfigError(f'its metric "{name}" has shape {np.shape(value)}; a metric is a scalar')
+        return found
+
+    return checked
+
+
+def make_agent(
+    config: Config, frame_shape: tuple[int, int, int], num_actions: int, *, trained: bool = True
+) -> Agent:
     """Builds an `Agent`.
 
     Args:
         config: a run's.
         frame_shape: (H, W, C) of its environments' frames.
         num_actions: of its game.
+        trained: whether it is to be trained, so that `check_losses` looks at its losses.
 
     Raises:
         srl_jax.specs.SpecError: where a spec does not fit.
+        ConfigError: a loss is wrong, see `check_losses`.
     """
     mode, views = modes.of(config), Views.of(config)
     encoder, algorithm, terms = components(config, frame_shape, num_actions)
@@ -220,7 +292,7 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
     plan = passes(mode, terms, config.encoder_optimizer)
     norms = make_norms(encoder, terms, mode, optimizer, views=views)
     init = make_init(encoder, terms, mode, optimizer, plan=plan, target_encoder=config.target_encoder)
-    return Agent(
+    agent = Agent(
         mode=mode,
         encoder=encoder,
         algorithm=algorithm,
@@ -243,6 +315,9 @@ def make_agent(config: Config, frame_shape: tuple[int, int, int], num_actions: i
         ),
         measures=make_functions(encoder, terms, mode, channels=frame_shape[-1], views=views),
     )
+    if trained:
+        check_losses(agent, config, frame_shape)
+    return agent
 
 
 def slow_params(state: TrainState) -> Params:

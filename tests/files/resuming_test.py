@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import hashlib
 import json
 import shutil
 
@@ -171,6 +172,52 @@ def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
     monkeypatch.delenv("NPROC")
     to_resume(run, CONFIG)
     assert "NPROC was '3' and is None" in capsys.readouterr().err
+
+
+def test_an_imported_file_that_has_changed_is_said_and_kept(tmp_path, capsys):
+    file, run = tmp_path / "mine.py", tmp_path / "run"
+    file.write_text("a = 1\n")
+    begun = dataclasses.replace(CONFIG, imports=(str(file), "json.decoder"))
+    (made,) = make(run, begun, checkpoints=(100,))
+    then = hashlib.sha256(file.read_bytes()).hexdigest()
+    assert json.loads((run / "config.json").read_text())["imported"] == {"mine.py": then}
+    # Where it lies by now does not matter.
+    moved = tmp_path / "elsewhere" / "mine.py"
+    moved.parent.mkdir()
+    file.rename(moved)
+    wanted = dataclasses.replace(begun, imports=(str(moved), "json.decoder"))
+    assert to_resume(run, wanted) == made and capsys.readouterr().err == ""
+
+    moved.write_text("a = 2\n")
+    now = hashlib.sha256(moved.read_bytes()).hexdigest()
+    assert to_resume(run, wanted) == made
+    said = f"resume: {run}: mine.py was {then!r} and is {now!r}: results may differ from those of a run that"
+    assert capsys.readouterr().err == f"{said} did not end\n"
+    with going_on(run, made, wanted):
+        pass
+    (continued,) = json.loads((run / "config.json").read_text())["continued"]
+    assert continued["changed"] == {"mine.py": now}
+    assert to_resume(run, wanted) == made and capsys.readouterr().err == ""
+
+
+def test_a_run_from_before_there_were_sums_of_files_says_nothing_of_them(tmp_path, capsys):
+    (tmp_path / "mine.py").touch()
+    begun = dataclasses.replace(CONFIG, imports=(str(tmp_path / "mine.py"),))
+    (made,) = make(tmp_path / "run", begun, checkpoints=(100,))
+    path = tmp_path / "run" / "config.json"
+    about = json.loads(path.read_text())
+    del about["imported"]
+    path.write_text(json.dumps(about))
+    assert to_resume(tmp_path / "run", begun) == made and capsys.readouterr().err == ""
+
+
+def test_files_of_one_name_have_one_sum(tmp_path):
+    files = [tmp_path / folder / "mine.py" for folder in "ab"]
+    for file in files:
+        file.parent.mkdir()
+        file.write_text(file.parent.name)
+    assert provenance.sums(map(str, files)) == {"mine.py": hashlib.sha256(b"ab").hexdigest()}
+    assert provenance.sums([str(tmp_path / "gone.py"), "json"]) == {}
 
 
 @pytest.mark.parametrize("continued", [1, [1], [{}], [{"changed": 1}]])

@@ -86,7 +86,7 @@ def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
         monkeypatch.setattr(evaluate, "FLAGS", values)
         evaluate.main([])
 
-    monkeypatch.setattr(loading, "make_agent", agent_of)
+    monkeypatch.setattr(loading, "make_agent", lambda *of, trained: agent_of(*of))
     play()
     played, row = json.loads(capsys.readouterr().out), rows(whole)[-1]
     assert (played["returns"], played["lengths"]) == (row["final/returns"], row["final/lengths"])

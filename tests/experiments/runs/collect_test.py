@@ -1,5 +1,7 @@
 """Tests of experiments.runs.collect."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -103,6 +105,27 @@ def test_runs_of_an_arm_differ_in_their_seed_alone(tmp_path):
     write_run(tmp_path / "a/seed2", seed=2, gamma=0.9)
     with pytest.raises(ConfigError, match="seed2.*a on Catch.*gamma is 0.99 there and 0.9 here$"):
         collect.check_arms(collect.load_runs(tmp_path))
+
+
+def test_an_arm_whose_runs_imported_other_files_is_named(tmp_path, capsys):
+    def run(arm, seed, then, *later):
+        path = write_run(tmp_path / f"{arm}/seed{seed}", seed=seed) / "config.json"
+        more = {"imported": {"mine.py": then}, "continued": [{"changed": {"mine.py": x}} for x in later]}
+        path.write_text(json.dumps(json.loads(path.read_text()) | more))
+
+    one, other = "0123456789" * 6, "abcdefghij" * 6
+    for seed in (0, 1):
+        run("a", seed, one)
+    write_run(tmp_path / "a/seed2", seed=2)  # from before it was kept
+    collect.check_arms(collect.load_runs(tmp_path))
+    assert capsys.readouterr().err == ""
+    run("a", 3, other)
+    run("b", 0, one, other)
+    collect.check_arms(collect.load_runs(tmp_path))
+    line = "on Catch: the imported mine.py was not the same in all runs: sha256 0123456789"
+    assert capsys.readouterr().err == (
+        f"a {line} (seed 0, 1); sha256 abcdefghij (seed 3)\nb {line}, then abcdefghij (seed 0)\n"
+    )
 
 
 @pytest.mark.parametrize(
