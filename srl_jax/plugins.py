@@ -204,6 +204,11 @@ def reason(error: BaseException, path: Path | None = None) -> str:
     return " ".join(f"{f'line {lines[-1]}: ' if lines else ''}{what}".split())
 
 
+def foreign(factory: Any) -> bool:
+    """Whether a function is written outside this package."""
+    return not Path(origin(factory)).is_relative_to(Path(__file__).parent)
+
+
 def origin(factory: Any) -> str:
     """The file in which a function is written, or its module where that is not known."""
     while isinstance(factory, functools.partial):

@@ -182,13 +182,16 @@ def components(
     return encoder, algorithm, terms
 
 
-def check_losses(agent: Agent, config: Config, frame_shape: tuple[int, int, int]) -> None:
-    """Whether each loss can be computed and gives what `Objective.loss` says. Compiles nothing.
+def check_losses(
+    agent: Agent, terms: Mapping[str, Objective], config: Config, frame_shape: tuple[int, int, int]
+) -> None:
+    """Whether losses can be computed and give what `Objective.loss` says. Compiles nothing; 0.1 s a loss.
 
     Each one sees a window of its own horizon, though another objective may make the run's windows longer.
 
     Args:
         agent: of the configuration.
+        terms: those of its objectives that are looked at.
         config, frame_shape: see `make_agent`.
 
     Raises:
@@ -199,7 +202,7 @@ def check_losses(agent: Agent, config: Config, frame_shape: tuple[int, int, int]
     def rows(dtype: Any, *shape: int) -> Any:
         return jax.ShapeDtypeStruct((config.batch_size, *shape), dtype)
 
-    for name, term in agent.objectives.items():
+    for name, term in terms.items():
         ahead = max(1, term.horizon)
         numbers = rows(np.float32, ahead)
         window = Window(
@@ -255,7 +258,7 @@ def make_agent(
         config: a run's.
         frame_shape: (H, W, C) of its environments' frames.
         num_actions: of its game.
-        trained: whether it is to be trained, so that `check_losses` looks at its losses.
+        trained: whether it is to be trained, so that `check_losses` looks at losses of outside the package.
 
     Raises:
         srl_jax.specs.SpecError: where a spec does not fit.
@@ -316,7 +319,8 @@ def make_agent(
         measures=make_functions(encoder, terms, mode, channels=frame_shape[-1], views=views),
     )
     if trained:
-        check_losses(agent, config, frame_shape)
+        foreign = {name: term for name, term in terms.items() if plugins.foreign(term.loss)}
+        check_losses(agent, foreign, config, frame_shape)
     return agent
 
 

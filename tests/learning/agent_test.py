@@ -6,7 +6,7 @@ import pytest
 from srl_jax import objectives, rl
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
-from srl_jax.learning.agent import make_agent
+from srl_jax.learning.agent import check_losses, make_agent
 from srl_jax.types import Objective
 from tests.helpers import NUM_ACTIONS, SMALL, agent_of
 
@@ -73,4 +73,6 @@ def test_a_loss_of_rl_that_is_wrong_is_named(monkeypatch):
 @pytest.mark.parametrize("name", objectives.REGISTRY)
 def test_no_loss_of_the_package_reads_beyond_its_horizon(name):
     views = {"rl_view": "shift@each", "target_view": "intensity"}
-    agent_of(Config(**{**SMALL, "mode": "joint", "objectives": (name,), **views}))
+    config = Config(**{**SMALL, "mode": "joint", "objectives": (name,), **views})
+    agent = agent_of(config)
+    check_losses(agent, agent.objectives, config, (42, 42, 1))
