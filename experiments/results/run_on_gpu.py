@@ -5,9 +5,9 @@
 
 What has not ended after so many seconds, or when the script gets SIGTERM, is stopped by SIGTERM and keeps its
 rows. On one H200 with 16 cores four runs at a time make 7,800 env steps a second together, eight 5,500 (the
-emulators' threads wait for cores), and thirteen pairs of seeds (`--seeds=0,1`) 1,250; on one H100 three made
-4,400 with all products in float32. `python -m experiments.figures` with the same file makes the same runs on
-a CPU.
+emulators' threads wait for cores), and thirteen pairs of seeds (`--seeds=0,1`) 1,250. On one H100 three made
+3,800, evaluations included and with all products in float32. `python -m experiments.figures` with the same
+file makes the same runs on a CPU.
 """
 
 import argparse

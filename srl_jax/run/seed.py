@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from srl_jax import specs
 from srl_jax.config import Config, difference
 from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
@@ -61,7 +62,7 @@ class Seed:
             raise ConfigError(
                 f"--buffer_size={config.buffer_size}: {error}; --num_envs={config.num_envs}, "
                 f"--frame_stack={config.frame_stack} and the {agent.horizon} steps ahead that "
-                f"--rl={config.rl.partition(':')[0]}:n_step= or --objective looks say how much it takes"
+                f"--rl={specs.split(config.rl)[0]}:n_step= or --objective looks say how much it takes"
             ) from None
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far

@@ -257,7 +257,7 @@ def test_training_on_one_batch_lowers_the_loss_and_vmapped_seeds_are_single_runs
     singles = [helpers.random_state(row.init, seed) for seed in (0, 1)]
     both = jax.tree.map(lambda *leaves: jnp.stack(leaves), *singles)
     history = []
-    for i in range(40):
+    for i in range(80):
         both, _, metrics = row.vmapped(both, row.window, hyper)
         history.append(metrics[f"loss/{row.name}"])
         if i < 2:
@@ -273,9 +273,7 @@ def test_training_on_one_batch_lowers_the_loss_and_vmapped_seeds_are_single_runs
     first, second = (jax.tree.map(lambda x, i=i: x[i], both.params) for i in range(2))
     assert helpers.all_moved(first, second)
     history = np.array(history)
-    # C51 cannot reach 0, and most of vicreg's loss is a variance that its views change in every update.
-    share = 1.0 if row.name == "vicreg" else 0.95
-    assert np.all(history[-5:].mean(0) < share * history[:5].mean(0)), history
+    assert np.all(history[-5:].mean(0) < 0.95 * history[:5].mean(0)), history  # C51 cannot reach 0
 
 
 @pytest.mark.parametrize("name", [name for name, term in _BUILT.items() if term.image])

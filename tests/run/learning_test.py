@@ -28,9 +28,8 @@ def run(path, preset, **overrides):
 
 
 def test_joint(tmp_path):
-    # Half the preset's batch, to save time. Four seeds have -0.16 to 0.42.
-    rows, final = run(tmp_path / "joint", "catch/joint", steps=16_000, eval_every=16_000, batch_size=32)
-    assert final > -0.4
+    rows, final = run(tmp_path / "joint", "catch/joint", batch_size=32)  # half the preset's, to save time
+    assert final > -0.2
     losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
     assert losses[-1] < 0.6 * losses[0]
 
