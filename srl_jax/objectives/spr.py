@@ -19,7 +19,8 @@ HIDDEN = 512
 class Transition(nn.Module):
     """SPR's transition model: a map and an action -> the next map, float32 [B, D], [B, A] -> [B, D].
 
-    Two convolutions, the action as planes beside the map; its output is renormalised as its input is.
+    Two convolutions with a ReLU behind each, the action as planes beside the map; what comes out is
+    renormalised as the latents are (the authors' code, `src/models.py`, which has BatchNorm, too).
 
     Attributes:
         shape: (H', W', C') of the map, H' W' C' = D. A latent behind a bottleneck is a map of one pixel.
@@ -34,7 +35,7 @@ class Transition(nn.Module):
         planes = jnp.broadcast_to(action[:, None, None], (z.shape[0], height, width, action.shape[-1]))
         x = jnp.concatenate([z.reshape(-1, *self.shape), planes], -1)
         x = nn.relu(Conv(channels, side, 1, padding="SAME", name="first")(x))
-        x = Conv(channels, side, 1, padding="SAME", name="second")(x)
+        x = nn.relu(Conv(channels, side, 1, padding="SAME", name="second")(x))
         return min_max(x.reshape(z.shape))
 
 

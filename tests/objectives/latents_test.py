@@ -120,7 +120,7 @@ def test_spr_against_numpy(mask):
     for k in range(steps):
         action = np.eye(NUM_ACTIONS)[window.actions[:, k]]
         maps = np.maximum(linear(head["transition"]["first"], np.concatenate([state, action], -1)), 0)
-        state = scaled(linear(head["transition"]["second"], maps))
+        state = scaled(np.maximum(linear(head["transition"]["second"], maps), 0))
         y = linear(head["predictor"], linear(head["projection"], state))
         goal = linear(behind["projection"], scaled(slow[k + 1]))
         cosine = (y * goal).sum(-1) / np.linalg.norm(y, axis=-1) / np.linalg.norm(goal, axis=-1)

@@ -80,7 +80,7 @@ def test_spr_by_the_first_layer_of_rl_against_numpy(target, options, layers):
     for k in range(STEPS):
         x = np.concatenate([state, np.eye(NUM_ACTIONS)[window.actions[:, k]]], -1)
         maps = np.maximum(linear(own["transition"]["first"], x), 0)
-        state = scaled(linear(own["transition"]["second"], maps))
+        state = scaled(np.maximum(linear(own["transition"]["second"], maps), 0))
         y = linear(own["predictor"], project(of_rl, state))
         goal = project(lagged, scaled(slow[k + 1])) if target == "slow" else project(of_rl, scaled(z[k + 1]))
         cosine = (y * goal).sum(-1) / np.linalg.norm(y, axis=-1) / np.linalg.norm(goal, axis=-1)
@@ -248,7 +248,7 @@ def test_pictures_and_decoder_errors_of_a_tied_decoder_are_made_by_the_encoders_
     init = make_init(encoder, terms, MODES["pretrain"], make_optimizer(terms))
     params, window = helpers.random_state(init).params, make_window(horizon=1)
     z = draw(BATCH, 3)
-    errors, _, _ = functions.decode["reconstruction"](params, z, window)
+    _, errors, _, _ = functions.decode["reconstruction"](params, z, window)
     kernels = jax.tree.map(lambda x: 2 * x, params["encoder"])
-    others, _, _ = functions.decode["reconstruction"](params | {"encoder": kernels}, z, window)
+    _, others, _, _ = functions.decode["reconstruction"](params | {"encoder": kernels}, z, window)
     assert errors.shape == (BATCH,) and not np.allclose(errors, others)
