@@ -102,7 +102,7 @@ _DER = {
     "beta_anneal_steps": 100_000,
     "slow_update_every": 2_000,
 }
-_VIEW = {"rl_view": "shift+intensity", "srl_view": "shift+intensity"}
+_VIEW = {"rl_view": "shift+intensity@each", "srl_view": "shift+intensity@each"}
 _JOINT_100K = {"mode": "joint", "encoder_optimizer": "summed"}
 _DOPAMINE = {**_100K, "encoder": "nature:padding=same,init=xavier", "beta": 0.5, "beta_final": 0.5}
 _DRQ = {
@@ -111,7 +111,7 @@ _DRQ = {
     "rl": "drq:n_step=10,shared_hidden=true,slow=none,copies=1,target_copies=1,view=shift+intensity",
     "eps_train": 1.0,
     "eps_final": 0.1,
-    "eps_anneal_steps": 5_000,
+    "eps_anneal_steps": 6_600,
     "eps_eval": 0.05,
 }
 _OF_SPR = {
@@ -154,15 +154,15 @@ _ATARI100K: dict[str, dict[str, Any]] = {
         "rl": "rainbow:double=false,dueling=false,noisy=false,n_step=3",
         "updates_per_step": 8,
         "learn_start": 20_000,
-        "slow_update_every": 500,
+        "slow_update_every": 4_000,  # of eight updates an env step
         "lr_rl": 6.25e-5,
         "eps_train": 1.0,
         "eps_final": 0.01,
-        "eps_anneal_steps": 50_000,
+        "eps_anneal_steps": 70_000,
     },
     "drq": _DRQ,
     "drq_eps": {**_DRQ, "eps_final": 0.01, "eps_eval": 0.001},
-    "curl": {**_DER, **_JOINT_100K, "objectives": ("infonce",)},
+    "curl": {**_DER, **_JOINT_100K, "objectives": ("infonce:temperature=10",)},
     "spr": _SPR,
     "spr_resets": {**_SPR_JAX, "reset": "head", "reset_every": 20_000, "reset_last": 80_000},
     "sr_spr": {
