@@ -255,6 +255,7 @@ def check(
             "RL's step, so that the two do not meet; give --encoder_optimizer=summed or simultaneous"
         )
     _check_terminal(config)
+    _check_corrupted(config)
     _check_ratios(config)
     return config
 
@@ -266,6 +267,18 @@ def _check_terminal(config: "Config") -> None:
         flag = f"gamma_anneal={text}" if config.gamma else "gamma=0"
         why = "a discount of 0 is how --objective=terminal knows a terminal state"
         raise ConfigError(f"--{flag}: {why}; give a gamma above 0")
+
+
+def _check_corrupted(config: "Config") -> None:
+    if not (view := config.srl_view).endswith("@each"):
+        return
+    for name, options in map(specs.split, config.objectives):
+        for option in ("noise", "masked") if name == "reconstruction" else ():
+            if option in options and specs.parse_value(options[option], float):
+                raise ConfigError(
+                    f"--srl_view={view}: {name}:{option}={options[option]} corrupts observations as replay "
+                    f"has them, which have no view of their own; give --srl_view={view.removesuffix('@each')}"
+                )
 
 
 def _check_ratios(config: "Config") -> None:

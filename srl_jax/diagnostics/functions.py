@@ -22,10 +22,11 @@ class Functions(NamedTuple):
 
     Attributes:
         encode: (encoder's parameters, frames uint8 [B, S, H, W, C]) -> float32 [B, D].
-        decode: {objective: (params, latents [B, D], Window) -> (errors [B], targets, outputs)}, of those with
-            an image that the latent of s_t is enough for. Errors are squared and averaged over the image. Of
-            targets and outputs the newest two frames, float32 [B, 2, H, W, C] (of observations of one frame,
-            [B, 1, H, W, C]).
+        decode: {objective: (params, latents [B, D], Window) -> (valid [B], errors [B], targets, outputs)}, of
+            those with an image that the latent of s_t is enough for. A row is valid whose episode goes on as
+            far as the objective looks ahead. Errors are squared and averaged over the image. Of targets and
+            outputs the newest two frames, float32 [B, 2, H, W, C] (of observations of one frame, [B, 1, H, W,
+            C]).
         groups: of the parameters, which `encode` and `decode` read.
         others: names of objectives with an image that need more than that.
         conflict: `make_conflict`'s; None where RL and representation losses do not both run.
@@ -109,8 +110,10 @@ def _decode(name: str, objective: Objective) -> Callable:
         head = objective.head(params[name], objective.read(params))
         target, output = image(head, Latents(known, known), window)
         errors = jnp.mean((output - target) ** 2, (1, 2, 3))
+        ahead = objective.horizon
+        valid = window.valid[:, ahead - 1] > 0 if ahead else jnp.ones(len(errors), bool)
         channels = window.frames.shape[-1]
-        return errors, _newest(target, channels), _newest(output, channels)
+        return valid, errors, _newest(target, channels), _newest(output, channels)
 
     return decode
 

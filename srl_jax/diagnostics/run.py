@@ -140,20 +140,19 @@ class Diagnostics:
         """The errors of the objectives' decoders."""
 
         def crossed(name: str, parts: Params, latents: np.ndarray) -> float:
-            decoded = self._decode(name, parts, latents, CROSSED)
-            return float(np.concatenate([errors for errors, _, _ in decoded]).mean())
+            valid, errors, *_ = self._decode(name, parts, latents, CROSSED)
+            return _mean(errors[valid])
 
         values: dict[str, Any] = {}
         names = sorted(self._functions.decode)
         for name in names:
-            errors, targets, outputs = (
-                np.concatenate(x) for x in zip(*self._decode(name, params, now.latents, DECODED), strict=True)
-            )
-            itself = float(errors[:CROSSED].mean())
+            valid, errors, targets, outputs = self._decode(name, params, now.latents, DECODED)
+            itself = _mean(errors[:CROSSED][valid[:CROSSED]])
             values[f"decoder_now/{name}"] = [crossed(name, params, then.latents) for then in kept.values()]
             values[f"decoder_now/{name}"] += [itself]
             values[f"encoder_now/{name}"] = []
             if targets.shape[1] == 2:  # else nothing tells what moves
+                targets, outputs = targets[valid], outputs[valid]
                 found = measures.moving_errors(targets[:, 0], targets[:, 1], outputs[:, 1])
                 values |= {f"error/{name}/{what}": value for what, value in found.items()}
         for step in kept:
@@ -163,10 +162,11 @@ class Diagnostics:
                 values[f"encoder_now/{name}"].append(error)
         return values
 
-    def _decode(self, name: str, params: Params, latents: np.ndarray, number: int) -> list[tuple]:
-        """What `Functions.decode` says of the first so many held-out observations, batch by batch."""
+    def _decode(self, name: str, params: Params, latents: np.ndarray, number: int) -> list[np.ndarray]:
+        """What `Functions.decode` says of the first so many held-out observations."""
         decode, windows = self._functions.decode[name], self._held_out.windows
-        return [jax.device_get(decode(params, latents[p], _rows(windows, p))) for p in _parts(number)]
+        found = [jax.device_get(decode(params, latents[p], _rows(windows, p))) for p in _parts(number)]
+        return [np.concatenate(x) for x in zip(*found, strict=True)]
 
     def _keep(self, encoder: Params) -> Kept:
         observations = self._held_out.observations
@@ -219,6 +219,11 @@ def _plain(value: Any) -> Any:
         return value
     rounded = np.float32(value)
     return float(str(rounded)) if np.isfinite(rounded) else None
+
+
+def _mean(values: np.ndarray) -> float:
+    """Their mean; NaN of none."""
+    return float(values.mean()) if len(values) else math.nan
 
 
 def _parts(number: int) -> list[slice]:

@@ -69,7 +69,7 @@ def forward_pixels(
         first, second = jax.random.split(key)
         return {"decoder": decoder.init(first), "gate": init_gate(second)}
 
-    def picture(head: Params, latents: Latents, window: Window):
+    def predicted(head: Params, latents: Latents, window: Window):
         actions = one_hot(window.actions[:, :steps], context.num_actions).reshape(-1, inputs)
         wanted = image(window, steps)
         if target == "difference":
@@ -78,8 +78,14 @@ def forward_pixels(
             return wanted, decoder.apply(head["decoder"], gate(head["gate"], latents.online(0), actions))
         return wanted, decoder.apply(head, jnp.concatenate([latents.online(0), actions], -1))
 
+    def picture(head: Params, latents: Latents, window: Window):
+        wanted, output = predicted(head, latents, window)
+        if target == "difference":  # as observations, which can be told from what stood still
+            wanted, output = (image(window, 0) + 2.0 * x - 1.0 for x in (wanted, output))
+        return wanted, output
+
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
-        wanted, output = picture(head, latents, window)
+        wanted, output = predicted(head, latents, window)
         return window.valid[:, steps - 1] * jax.vmap(mean_squared_error)(output, wanted), {}
 
     return Objective(init, loss, weight, horizon=steps, is_decoder=True, image=picture)

@@ -23,6 +23,7 @@ from srl_jax.learning.optim import RL
 from srl_jax.learning.update import Hyper
 from srl_jax.replay import Replay
 from srl_jax.types import Objective, TrainState
+from srl_jax.window import observation
 from tests.helpers import SMALL, make_encoder, make_window, random_params
 
 
@@ -249,6 +250,22 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
     )
 
 
+def test_a_row_is_decoded_as_far_as_its_episode_goes():
+    encoder = make_encoder()
+    decoder = encoder.make_decoder()
+    term = objective(1.0)._replace(
+        image=lambda head, latents, window: (observation(window, 2), decoder.apply(head, latents.online(0))),
+        init=decoder.init,
+        horizon=2,
+    )
+    decode = make_functions(encoder, {"x": term}, MODES["pretrain"], channels=1).decode["x"]
+    params = {"encoder": encoder.init(jax.random.key(0)), "x": decoder.init(jax.random.key(1))}
+    window = make_window(horizon=2, size=encoder.observation_shape[0])
+    window.valid[1, 1] = window.valid[2] = 0
+    valid, errors, *_ = decode(params, np.zeros((len(window.valid), encoder.features), np.float32), window)
+    assert valid.tolist() == [True, False, False, True] and errors.shape == (4,)
+
+
 def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
     monkeypatch.setattr(heldout, "WINDOWS", 64)
     config = Config(**{**SMALL, "diagnostics": True, "eval_every": 60})
@@ -256,7 +273,8 @@ def test_a_decoder_that_is_damaged_later_has_no_errors(tmp_path, monkeypatch):
 
     def decode(params, z, window):  # the errors are the decoder's number, whatever the latent
         image = np.zeros((len(z), 2, 2, 2, 1), np.float32)
-        return np.full(len(z), params["x"]["w"]), image, image
+        valid = np.arange(len(z)) % 3 > 0  # what is behind an episode's end does not count
+        return valid, np.where(valid, params["x"]["w"], 1e6), image, image
 
     encode = lambda params, frames: frames[:, -1, ::8, ::8].reshape(len(frames), -1) * params["w"]  # noqa: E731
     groups = "encoder", "x"

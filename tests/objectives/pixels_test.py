@@ -1,11 +1,15 @@
 """The representation objectives that predict pixels, each by a number that is known; and what collapses."""
 
+import dataclasses
+
 import jax
 import numpy as np
 import pytest
 
-from srl_jax import encoders, objectives
+from srl_jax import checks, encoders, objectives
+from srl_jax.config import Config
 from srl_jax.envs import make
+from srl_jax.errors import ConfigError
 from srl_jax.latents import make_latents
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import make_optimizer
@@ -135,10 +139,13 @@ def test_differences_two_steps_ahead(action):
     window = make_window(horizon=2)
     window.valid[1, 1] = 0
     losses, head, _ = loss_of(objective, latents_of(draw(1, BATCH, 8)), window)
-    target, _ = objective.image(head, latents_of(draw(1, BATCH, 8)), window)
+    target, output = objective.image(head, latents_of(draw(1, BATCH, 8)), window)
     frames = window.frames.astype(np.float32) / 255
     stacks = [np.moveaxis(frames[:, k : k + 4, :, :, 0], 1, -1) for k in (0, 2)]
-    np.testing.assert_allclose(target, (1 + stacks[1] - stacks[0]) / 2, atol=1e-6)
+    # The picture is of observations; the loss is of half of 1 + s_{t+2} - s_t, so half as far off.
+    np.testing.assert_allclose(target, stacks[1], atol=1e-6)
+    off = np.mean((output - target) ** 2, (1, 2, 3)) / 4
+    np.testing.assert_allclose(losses, window.valid[:, 1] * off, rtol=1e-5)
     assert objective.horizon == 2 and losses[1] == 0 and np.all(np.delete(losses, 1) > 0)
 
 
@@ -148,6 +155,16 @@ def test_multiplied_actions_by_hand():
     params = {"latent": eye, "action": {"kernel": np.array([[2.0, 3.0]]), "bias": np.zeros(2)}, "out": eye}
     output = gate.apply({"params": params}, np.array([[1.0, 10.0]]), np.array([[1.0]]))
     np.testing.assert_allclose(output, [[2, 30]])
+
+
+def test_what_is_corrupted_has_no_view_of_its_own():
+    for option in ("noise=0.1", "masked=0.5"):
+        losses = f"reconstruction:{option}", "inverse"
+        given = Config(mode="joint", objectives=losses, srl_view="shift@each")
+        with pytest.raises(ConfigError, match=f"^--srl_view=shift@each: reconstruction:{option} .*=shift$"):
+            checks.check(given, given=["srl_view"])
+    clean = ("reconstruction:noise=0,moving=1",)
+    assert checks.check(dataclasses.replace(given, objectives=clean), given=["srl_view"]).srl_view
 
 
 # Collapse
