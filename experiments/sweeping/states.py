@@ -39,7 +39,8 @@ class State(NamedTuple):
 def look(path: Path, config: Config) -> State:
     """How far a run is; reads a few small files and writes nothing.
 
-    A run is done if its last checkpoint is of a run that has ended and its rows are there.
+    A run is done if its last checkpoint is of a run that has ended and its rows are there. One that was packed
+    and unpacked has no checkpoints; it is done if it had finished.
 
     Args:
         path: of the run directory.
@@ -66,11 +67,13 @@ def look(path: Path, config: Config) -> State:
         return State("busy", reason=holder(error))
     if blank:
         return State("missing")
+    ended = ending.read(path)
+    if not (path / "checkpoints").exists() and ended is not None and ended.status == "finished":
+        return State("done", ended.env_steps)
     try:
         found = checkpoint.read_manifest(path)
     except ConfigError:
         return State("resumable")  # from an older one, or not begun: the run itself finds out
-    ended = ending.read(path)
     over = NUMBERS not in found.files or (ended is not None and ended.status == "finished")  # --keep_replay
     if not over or _alike(resuming.another_run, found.config, config):
         return State("resumable", found.env_steps)

@@ -165,6 +165,16 @@ def test_a_run_that_kept_its_replay_is_complete_once_it_has_finished(tmp_path):
     assert states.look(tmp_path, CONFIG) == ("done", 500, "")
 
 
+def test_a_run_that_was_unpacked_is_done_if_it_had_finished(tmp_path):
+    CONFIG.save(tmp_path)
+    (tmp_path / "metrics.jsonl").write_text('{"kind": "eval", "env_steps": 500}\n')
+    for status, kind in (("stopped", "resumable"), ("finished", "done")):
+        ending.write(tmp_path, Ending(status, 500))
+        assert states.look(tmp_path, CONFIG).kind == kind
+    with pytest.raises(ConfigError, match="another configuration: "):
+        states.look(tmp_path, dataclasses.replace(CONFIG, gamma=0.5))
+
+
 def test_a_run_of_before_an_option_or_with_what_nothing_reads_is_the_run_that_was_planned(tmp_path):
     planned = completed(dataclasses.replace(CONFIG, rl="rainbow:hidden=8"))
     old = dataclasses.replace(planned, rl="rainbow:hidden=8,n_step=3", lr_srl=0.5)
