@@ -19,15 +19,12 @@ _RECONSTRUCTION = "reconstruction:weight=1"
 _FORWARD = "forward_pixels:weight=1"
 _L2 = "latent_l2:weight=1e-6"
 
-# Five choices that a textbook agent does not make, and a decoder that starts near black. With all five
-# Rainbow begins to learn Pong within 20,000 updates, with none it does not: experiments/results/pong_choices.
-_START = "init=he,zero_sum=true,gain=32,decoder_scale=0.1"
-_RAINBOW = "rainbow:init_std=1,priority=kl"
-_NATURE = f"nature:{_START}"
+# As the authors' code: PyTorch's initialisation, and pixels in 0..255.
+_NATURE = "nature:gain=255"
 
 # 50 epochs of 100,000 env steps. Pong is one of the thesis' seven games; --game takes another.
-_THESIS = {"game": "Pong", "rl": _RAINBOW, "steps": 5_000_000, "eval_every": 100_000}
-_256 = {**_THESIS, "encoder": f"sac_ae:features=256,{_START}"}
+_THESIS = {"game": "Pong", "rl": "rainbow", "steps": 5_000_000, "eval_every": 100_000}
+_256 = {**_THESIS, "encoder": "sac_ae:features=256,gain=255"}
 # What the authors ran as augmentation shifts the RL batch too. --augment=srl shifts only what the
 # representation losses see.
 _AUG = {"augment": "all"}
@@ -239,7 +236,7 @@ _ARMS: dict[str, dict[str, Any]] = {
     "rl_only_256_aug": {**_256, **_AUG, "mode": "rl_only"},
     # Figure 6.3, joint training.
     "joint_256": {**_256, **_JOINT},
-    "joint_50": {**_256, **_JOINT, "encoder": f"sac_ae:features=50,{_START}"},
+    "joint_50": {**_256, **_JOINT, "encoder": "sac_ae:features=50,gain=255"},
     # Figure 6.4, regularisation.
     "joint_256_l2_aug": {**_256, **_JOINT, **_AUG},
     "joint_256_noreg": {
@@ -268,14 +265,20 @@ def _small(values: dict[str, Any]) -> dict[str, Any]:
     return {**values, **own}
 
 
-def _textbook(values: dict[str, Any]) -> dict[str, Any]:
-    """Without the five choices, and the decoder's, of `_START` and `_RAINBOW`."""
-    own = {}
-    for field, choices in (("rl", _RAINBOW), ("encoder", _NATURE)):
-        name, options = split(values[field])
-        left_out = split(choices)[1]
-        own[field] = join(name, {key: x for key, x in options.items() if key not in left_out})
-    return {**values, **own}
+def _with_options(own: Mapping[str, Mapping[str, str | None]], values: dict[str, Any]) -> dict[str, Any]:
+    """Settings whose specifications have these options; None takes one back to its default."""
+    changed = {}
+    for field, options in own.items():
+        name, there = split(values[field])
+        changed[field] = join(name, {key: x for key, x in {**there, **options}.items() if x is not None})
+    return {**values, **changed}
+
+
+# A decoder that starts near black is not one of the five, and came with them.
+_FIVE_CHOICES = {
+    "encoder": {"init": "he", "zero_sum": "true", "gain": "32", "decoder_scale": "0.1"},
+    "rl": {"init_std": "1", "priority": "kl"},
+}
 
 
 def _over(own: Mapping[str, Any], values: dict[str, Any]) -> dict[str, Any]:
@@ -284,7 +287,10 @@ def _over(own: Mapping[str, Any], values: dict[str, Any]) -> dict[str, Any]:
 
 PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "small": _small,
-    "textbook": _textbook,
+    "textbook": functools.partial(
+        _with_options, {field: dict.fromkeys(options) for field, options in _FIVE_CHOICES.items()}
+    ),
+    "five_choices": functools.partial(_with_options, _FIVE_CHOICES),
     "aug": functools.partial(_over, _AUG),
     **{f"protocol/{name}": functools.partial(_over, own) for name, own in PROTOCOLS.items()},
 }
@@ -292,7 +298,8 @@ PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 
 PIECES_HELP = {
     "small": "at the size of Catch, minutes a run",
-    "textbook": "without the five choices that the thesis' presets make beside the textbook's agent",
+    "textbook": "with pixels in [0, 1] and PyTorch's initialisation, as a textbook's Rainbow",
+    "five_choices": "with the five choices of results/pong_choices, with which Pong is learnt earlier",
     "aug": "with random shift of all frames",
     **{f"protocol/{name}": text for name, text in PROTOCOLS_HELP.items()},
 }
@@ -305,7 +312,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "demo": {
         **_JOINT,
         "game": "Pong",
-        "rl": _RAINBOW,
+        "rl": "rainbow",
         "encoder": _NATURE,
         "steps": 20_000,
         "eval_every": 10_000,

@@ -1,8 +1,7 @@
 """Training with Tianshou's Rainbow and the settings of `thesis/rl_only_nature`; a side of `worker`.
 
 The loop is that of Tianshou's off-policy trainer, less its logging: collect one env step of all environments,
-then update once. Tianshou collects with the noisy layers' means, so only epsilon-greedy explores. It starts
-without our prior on values, and reads pixels in 0..255.
+then update once. Tianshou collects with the noisy layers' means, so only epsilon-greedy explores.
 
 Of Tianshou's vector environments `DummyVectorEnv`, which steps them one after the other, is the fastest on
 two cores: 10 environments of Pong take 4.8 ms, against 6.0 ms with `SubprocVectorEnv` and 5.7 ms with

@@ -20,10 +20,9 @@ STRIDES = {
 }
 """{preset: the strides of its encoder}; all else is seen from the parameters."""
 
-INPUT_GAIN = 32.0  # the presets' option gain
+INPUT_GAIN = 255.0  # the presets' option gain
 N_STEP = 3
 ATOMS, V_MIN, V_MAX = 51, -10.0, 10.0
-INIT_STD = 1.0  # the presets' option: of the value distribution at the start, in units of reward
 LEARNING_RATE, ADAM_EPS = 1e-4, 1e-8
 CHECK_ADAM_EPS = 1e-3  # see srl_jax' side
 DECODER_WEIGHT_DECAY = 1e-7
@@ -82,7 +81,6 @@ class Learner:
         self.optimizers = [torch.optim.Adam(some, lr=LEARNING_RATE, eps=adam_eps) for some in groups]
         self.joint = bool(decoder)
         self.support = torch.linspace(V_MIN, V_MAX, ATOMS)
-        self.prior = -0.5 * (self.support / INIT_STD) ** 2
 
     def _in_torchs_order(self, path: str, value: np.ndarray) -> Tensor:
         """A parameter of srl_jax as PyTorch's functions take it."""
@@ -100,9 +98,9 @@ class Learner:
         """One update on the batch: a gradient step, or two.
 
         Returns:
-            The temporal-difference errors, float32 [B], in nats: the Kullback-Leibler divergence of the value
-            distribution from its target, which priorities are made of. And the metrics, scalars: each mean
-            loss, their weighted sum "total" and the mean of the largest value of s_t.
+            The temporal-difference errors, float32 [B], in nats: the cross-entropy of the value distribution
+            with its target, which priorities are made of. And the metrics, scalars: each mean loss, their
+            weighted sum "total" and the mean of the largest value of s_t.
         """
         batch = {name: torch.from_numpy(array) for name, array in self.window.items()}
         if self.noisy:
@@ -138,8 +136,7 @@ class Learner:
                     for group, slow in SLOW.items():
                         if path.startswith(group):
                             self.params[path.replace(group, slow)].copy_(value)
-            entropy = -(target * target.clamp(min=1e-30).log()).sum(-1)
-            td_error = (cross_entropy - entropy).clamp(min=0).numpy()
+            td_error = cross_entropy.detach().numpy()
             total = sum(WEIGHTS[name] * loss for name, loss in losses.items())
             q_max = (logits_tm1.softmax(-1) @ self.support).amax(-1).mean()
         metrics = {name: loss.detach() for name, loss in losses.items()}
@@ -169,13 +166,10 @@ class Learner:
         return x
 
     def _logits(self, path: str, z: Tensor) -> Tensor:
-        """Rainbow's head: latents [B, D] -> logits [B, A, M], dueling and noisy.
-
-        The prior is the logits of a normal around 0, added to the state's.
-        """
+        """Rainbow's head: latents [B, D] -> logits [B, A, M], dueling and noisy."""
         q = self._noisy(f"{path}/q_out", F.relu(self._noisy(f"{path}/q_hidden", z))).unflatten(1, (-1, ATOMS))
         v = self._noisy(f"{path}/v_out", F.relu(self._noisy(f"{path}/v_hidden", z))).unflatten(1, (1, ATOMS))
-        return q - q.mean(1, keepdim=True) + v + self.prior
+        return q - q.mean(1, keepdim=True) + v
 
     def _noisy(self, path: str, x: Tensor) -> Tensor:
         """A linear layer with factorised Gaussian noise (Fortunato et al. 2018)."""

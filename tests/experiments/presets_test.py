@@ -84,9 +84,9 @@ def test_an_arm_is_what_its_name_says(name):
     features = "50" if name.endswith("_50") else "256"
     nature = name.endswith("nature")
     assert (encoder, options.get("features")) == (("nature", None) if nature else ("sac_ae", features))
-    # With the five choices of experiments/results/pong_choices.
-    assert {"init": "he", "zero_sum": "true", "gain": "32"}.items() <= options.items()
-    assert config.rl == "rainbow:init_std=1,priority=kl"
+    # As the authors' code starts: pixels in 0..255, and all else the textbook's.
+    assert options.keys() <= {"gain", "features"} and options["gain"] == "255"
+    assert config.rl == "rainbow"
     assert config.augment == ("all" if name.endswith("_aug") else "none")
     losses = [specs.split(text) for text in config.objectives]
     expected = []
@@ -147,6 +147,10 @@ def test_what_stands_later_overrides():
     textbook = preset_values("thesis/joint_256+textbook")
     assert (textbook["rl"], textbook["encoder"]) == ("rainbow", "sac_ae:features=256")
     assert textbook["stop_at_return"] == 20
+    early = preset_values("thesis/rl_only_nature+five_choices")
+    assert early["rl"] == "rainbow:init_std=1,priority=kl"
+    assert early["encoder"] == "nature:gain=32,init=he,zero_sum=true,decoder_scale=0.1"
+    assert preset_values("thesis/rl_only_nature+five_choices+textbook")["encoder"] == "nature"
     assert preset_values("catch/joint+small+aug")["encoder"] == "tiny"
 
 
@@ -156,7 +160,7 @@ def test_what_stands_later_overrides():
         ("thesis/joint_25", "did you mean thesis/joint_256"),
         ("thesis/joint_256+smal", "did you mean small"),
         ("small", "small changes a preset; write it behind one"),
-        ("catch/joint+", "valid: small, textbook, aug, protocol/dopamine_100k"),
+        ("catch/joint+", "valid: small, textbook, five_choices, aug"),
     ],
 )
 def test_a_preset_that_there_is_not_is_refused(name, told):
