@@ -10,9 +10,10 @@ from collections.abc import Callable
 
 from absl import flags
 
-from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import display
+from srl_jax.files.checkpoint import Manifest
+from srl_jax.files.metrics import read_metrics
 from srl_jax.specs import Info
 
 from .command_line import flags as config_flags
@@ -34,19 +35,31 @@ def check_gif(path: str) -> None:
     paths.check_file("gif", path, ".gif")
 
 
-def check_final(config: Config) -> None:
-    """Whether --final stands alone, and the run has final games.
+def check_final(manifest: Manifest) -> None:
+    """Whether --final stands alone, and the run has played final games by these parameters.
 
     Raises:
-        ConfigError: it does not, or has none.
+        ConfigError: it does not, or has not; or its rows cannot be read.
     """
     if not FLAGS.final:
         return
-    if not config.final_games:
+    if not manifest.config.final_games:
         raise ConfigError(f"--final: the run in {FLAGS.run} has no final games; give --games=100, say")
     for name in ("games", "envs", "seed", "epsilon"):
         if FLAGS[name].present:
             raise ConfigError(f"--{name}={FLAGS[name].value}: given beside --final, which has the run's own")
+    rows = manifest.path.parents[1] / "metrics.jsonl"
+    try:
+        played = [row["env_steps"] for row in read_metrics(rows) if row["kind"] == "final"]
+    except OSError as error:
+        raise ConfigError(f"--final: {rows}: {error.strerror}") from None
+    except ValueError as error:
+        raise ConfigError(f"--final: {error}") from None
+    if manifest.env_steps not in played:
+        raise ConfigError(
+            f"--final: no final games were played by {manifest.path}; name a run that has ended, or give "
+            "--games=100, say"
+        )
 
 
 def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> None:
@@ -65,10 +78,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     from srl_jax.files import checkpoint
     from srl_jax.learning.modes import MODES
 
-    config = checkpoint.read_manifest(FLAGS.run).config
+    manifest = checkpoint.read_manifest(FLAGS.run)
+    config = manifest.config
     if not MODES[config.mode].rl:
         raise ConfigError(f"--run={FLAGS.run}: a run of --mode={config.mode} has no policy to play with")
-    check_final(config)
+    check_final(manifest)
     if prepare is not None:
         prepare(FLAGS.tune_runtime, config.encoder)
 

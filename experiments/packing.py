@@ -80,6 +80,8 @@ def read(folder: Path, *, only_last: bool = False, mend: bool = False) -> list[R
             config = Config.from_values(about)
             ended = Ending(**run["ended"]) if run["ended"] else None
             place = folder / run["path"]
+            if Path(run["path"]).is_absolute() or ".." in Path(run["path"]).parts:
+                raise TypeError(f"{run['path']} is not below the folder")
         except (KeyError, TypeError) as error:
             raise ConfigError(f"{path}: not what packing writes ({error})") from None
         except ConfigError as error:
@@ -135,10 +137,17 @@ def added(here: Sequence[RunData], more: Iterable[RunData]) -> list[RunData]:
     """Runs and those among others that they do not have.
 
     Raises:
-        ConfigError: one of the others has the game, arm and seed of a run that has other rows or settings.
+        ConfigError: one of the others has the game, arm and seed of a run that has other rows or settings, or
+            the path of one that has others.
     """
     runs = {run.key: run for run in here}
+    places = {run.path: run for run in here}
     for run in more:
+        if (there := places.setdefault(run.path, run)).key != run.key:
+            raise ConfigError(
+                f"{run.path}: the place of {_name(*there.key)} and of {_name(*run.key)}; pack them together, "
+                "from the directory above both, or into two folders"
+            )
         there = runs.setdefault(run.key, run)
         for what, same in (("rows", there.rows == run.rows), ("settings", there.config == run.config)):
             if not same:

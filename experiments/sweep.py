@@ -93,6 +93,10 @@ def main(argv: list[str]) -> int:
     if not FLAGS.out:
         raise ConfigError("--out: missing; name a directory for the sweep, --out=runs/NAME")
     root = paths.check_place("out", FLAGS.out)
+    if FLAGS.status:
+        for name in ("presets", "games", "seeds", "grid", "dry_run", *options.given_flags(FLAGS)):
+            if FLAGS[name].present:
+                raise ConfigError(f"--{name}: --status tells of the sweep that is in --out; leave it out")
     how = options.launcher_options(FLAGS)
     workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
     if FLAGS.status:

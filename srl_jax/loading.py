@@ -117,8 +117,12 @@ class Loaded:
                 f"observations must be uint8, or float32 in [0, 1], [..., {wanted}], not "
                 f"{observations.dtype} {given}"
             )
+        ahead = observations.shape[:-3]
+        if 0 in ahead:
+            one = jax.eval_shape(function, jax.ShapeDtypeStruct((1, *shape), observations.dtype))
+            return jnp.zeros((*ahead, *one.shape[1:]), one.dtype)
         result = function(observations.reshape(-1, *shape))
-        return result.reshape(*observations.shape[:-3], *result.shape[1:])
+        return result.reshape(*ahead, *result.shape[1:])
 
 
 def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) -> Loaded:

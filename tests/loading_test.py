@@ -56,6 +56,7 @@ def test_observations_may_have_any_axes_in_front_and_are_bytes_or_in_0_to_1(load
     assert z.shape == (2, 3, 8) and loaded.q_values(x).shape == (2, 3, NUM_ACTIONS)
     np.testing.assert_allclose(loaded.encode(x[1, 2]), z[1, 2], atol=1e-5)
     assert loaded.act(x[1, 2]).shape == () and loaded.act(x).shape == (2, 3)
+    assert loaded.encode(x[:0]).shape == (0, 3, 8)
     np.testing.assert_allclose(loaded.encode(x / np.float32(255)), z, atol=1e-5)
 
 

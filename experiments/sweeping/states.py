@@ -39,8 +39,8 @@ class State(NamedTuple):
 def look(path: Path, config: Config) -> State:
     """How far a run is; reads a few small files and writes nothing.
 
-    A run is done if its last checkpoint is of a run that has ended and its rows are there. One that was packed
-    and unpacked has no checkpoints; it is done if it had finished.
+    A run is done if its last checkpoint is of a run that has ended and its rows are there. One that was
+    packed and unpacked has no checkpoints; it is done if it had finished.
 
     Args:
         path: of the run directory.
@@ -101,8 +101,9 @@ def _lacks(path: Path, found: checkpoint.Manifest) -> str:
         if (found.path / PARAMS).stat().st_size != found.files[PARAMS].bytes:
             return f"{PARAMS} has not the size that the manifest knows"
         with open(path / "metrics.jsonl", "rb") as file:
-            file.seek(-1, os.SEEK_END)
-            return "" if file.read(1) == b"\n" else "the last row of metrics.jsonl is cut short"
+            size = file.seek(0, os.SEEK_END)  # 0 of a run that was too short for a row
+            file.seek(max(size - 1, 0))
+            return "" if file.read(1) in (b"\n", b"") else "the last row of metrics.jsonl is cut short"
     except OSError as error:
         return f"{os.path.basename(error.filename or 'metrics.jsonl')}: {error.strerror}"
 

@@ -125,6 +125,23 @@ def test_a_run_that_is_there_with_other_rows_or_settings_is_refused(root, tmp_pa
     assert {path: path.read_bytes() for path in (tmp_path / "out").iterdir()} == there
 
 
+def test_two_runs_have_two_places(root, tmp_path):
+    over = Ending("finished", 200)
+    write_run(tmp_path / "a/seed0", seed=0, ended=over)
+    write_run(tmp_path / "b/seed0", seed=0, gamma=0.9, game="CatchDistractor", ended=over)
+    packing.pack(tmp_path / "a", tmp_path / "out")
+    with pytest.raises(
+        ConfigError, match=r"out/seed0: the place of Catch, .* and of CatchDistractor, .*seed 0"
+    ):
+        packing.pack(tmp_path / "b", tmp_path / "out")
+    configs = tmp_path / "out" / packing.CONFIGS
+    text = configs.read_text()
+    for path in ("../seed0", "/tmp/seed0"):
+        configs.write_text(text.replace('"path": "seed0"', f'"path": "{path}"'))
+        with pytest.raises(ConfigError, match=f"{path} is not below the folder"):
+            packing.unpack(tmp_path / "out", tmp_path / "again")
+
+
 def test_what_packing_did_not_write_is_refused(root, tmp_path):
     out = tmp_path / "out"
     packing.pack(root, out)

@@ -79,10 +79,10 @@ def test_a_run_ends_with_the_row_of_its_final_games(whole):
 
 
 def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
-    def play(*arguments):
+    def play(*arguments, run=whole):
         values = flags.FlagValues()
         evaluate.define_flags(values)
-        config_flags.parse(["evaluate", str(whole), "--final", *arguments], values, "run")
+        config_flags.parse(["evaluate", str(run), "--final", *arguments], values, "run")
         monkeypatch.setattr(evaluate, "FLAGS", values)
         evaluate.main([])
 
@@ -93,6 +93,9 @@ def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
     for given in ("--games=3", "--envs=1", "--seed=5", "--epsilon=0.5"):
         with pytest.raises(ConfigError, match=f"{given}: given beside --final"):
             play(given)
+    before = whole / "checkpoints/000000060"
+    with pytest.raises(ConfigError, match=f"^--final: no final games were played by {before}; "):
+        play(run=before)
 
 
 def test_nothing_else_of_a_run_depends_on_its_final_games(whole, tmp_path):

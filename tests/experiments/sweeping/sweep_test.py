@@ -165,11 +165,18 @@ def test_a_run_that_kept_its_replay_is_complete_once_it_has_finished(tmp_path):
     assert states.look(tmp_path, CONFIG) == ("done", 500, "")
 
 
+def test_a_run_that_was_too_short_for_a_row_is_complete(tmp_path):
+    complete(tmp_path, CONFIG)
+    CONFIG.save(tmp_path)
+    (tmp_path / "metrics.jsonl").write_bytes(b"")
+    assert states.look(tmp_path, CONFIG) == ("done", 500, "")
+
+
 def test_a_run_that_was_unpacked_is_done_if_it_had_finished(tmp_path):
     CONFIG.save(tmp_path)
     (tmp_path / "metrics.jsonl").write_text('{"kind": "eval", "env_steps": 500}\n')
-    for status, kind in (("stopped", "resumable"), ("finished", "done")):
-        ending.write(tmp_path, Ending(status, 500))
+    for how, kind in (("stopped", "resumable"), ("finished", "done")):
+        ending.write(tmp_path, Ending(how, 500))
         assert states.look(tmp_path, CONFIG).kind == kind
     with pytest.raises(ConfigError, match="another configuration: "):
         states.look(tmp_path, dataclasses.replace(CONFIG, gamma=0.5))
