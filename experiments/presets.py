@@ -299,7 +299,7 @@ PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
 PIECES_HELP = {
     "small": "at the size of Catch, minutes a run",
     "textbook": "with pixels in [0, 1] and PyTorch's initialisation, as a textbook's Rainbow",
-    "five_choices": "with the five choices of results/pong_choices, with which Pong is learnt earlier",
+    "five_choices": "with the five choices of results/pong_choices, of Rainbow's and C51's presets",
     "aug": "with random shift of all frames",
     **{f"protocol/{name}": text for name, text in PROTOCOLS_HELP.items()},
 }
