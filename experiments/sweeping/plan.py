@@ -90,7 +90,7 @@ def grid(arms: Sequence[Arm], texts: Sequence[str], flags: Flags) -> list[Arm]:
     Raises:
         ConfigError: one is not that, or no flag of training, or the flag is there already.
     """
-    known = [info.flag or name for name, info in INFOS.items()]
+    known = [*(info.flag or name for name, info in INFOS.items()), "protocol"]
     axes: dict[str, list[str]] = {}
     for text in texts:
         flag, _, rest = text.partition("=")

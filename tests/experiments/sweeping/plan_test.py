@@ -184,6 +184,9 @@ def test_a_grid_is_an_arm_for_each_combination():
         (lr, rl) for lr in (1e-4, 3e-4) for rl in ("rainbow", "dqn")
     }
     assert plan.grid(arms[:1], [], {}) == arms[:1]
+    arms = plan.grid([Arm("a", "catch/rl_only")], ["protocol=thesis,machado"], {})
+    entries = manifest.resolve(plan.plan(arms, [], [0], {}))
+    assert [config.eps_eval for _, config in entries.values()] == [0.005, 0.01]
 
 
 @pytest.mark.parametrize(
