@@ -229,16 +229,22 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         say(f"{path}: resumed from {manifests[0].env_steps:,} env steps")
     say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
+        started = contextlib.ExitStack()  # what is to be done once the run has begun
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
             if manifest:
-                stack.enter_context(going_on(directory, manifest, its_config))
+                started.callback(stack.enter_context(going_on(directory, manifest, its_config)))
             else:
                 stack.enter_context(run_directory(directory, its_config))
         caught = stack.enter_context(signals(again=interrupt))
         directories = [directory for directory, _ in runs]
         resumed = manifests if manifests[0] else None
         results = loop.train_seeds(
-            config, seeds or [config.seed], directories, resume=resumed, stop=lambda: bool(caught)
+            config,
+            seeds or [config.seed],
+            directories,
+            resume=resumed,
+            stop=lambda: bool(caught),
+            begun=started.close,
         )
         draw([directory for directory, _ in runs], [config for _, config in runs], results)
     if any(result.interrupted for result in results):

@@ -184,11 +184,11 @@ def _changes(path: Path, about: dict, wanted: Config) -> dict[str, tuple]:
 
 
 @contextlib.contextmanager
-def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[None]:
-    """Holds the directory of a run that is resumed, whose config.json is brought up to date.
+def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[Callable[[], None]]:
+    """Holds the directory of a run that is resumed, and yields what brings its config.json up to date.
 
-    The settings of `MAY_CHANGE` take their new values; what else has changed is under "continued". Where
-    nothing has, nothing is written.
+    That is called once the run has begun: what is refused changes nothing. The settings of `MAY_CHANGE` take
+    their new values; what else has changed is under "continued". Where nothing has, nothing is written.
 
     Args:
         path: the directory.
@@ -197,19 +197,22 @@ def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[None]:
 
     Raises:
         ConfigError: another process writes there.
-        SaveError: config.json could not be written.
+        SaveError: by what is yielded: config.json could not be written.
     """
     with rundir.held(path):
         there, about = config.read(path)
         values = {name: getattr(resumed, name) for name in MAY_CHANGE}
         settings = {name: value for name, value in values.items() if getattr(there, name) != value}
         changed = {name: now for name, (_, now) in _changes(path, about, resumed).items()}
-        if settings or changed:
-            now = {"env_steps": manifest.env_steps, "started": provenance.now()}
-            continued = [*about.get("continued", []), {**now, "changed": changed, "settings": settings}]
-            with saving(f"--out={path}"):
-                config.write(path, {**about, **settings, "continued": continued})
-        yield
+
+        def begun() -> None:
+            if settings or changed:
+                now = {"env_steps": manifest.env_steps, "started": provenance.now()}
+                continued = [*about.get("continued", []), {**now, "changed": changed, "settings": settings}]
+                with saving(f"--out={path}"):
+                    config.write(path, {**about, **settings, "continued": continued})
+
+        yield begun
 
 
 def all_to_resume(

@@ -160,6 +160,26 @@ def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     assert len(loop.calls) == 1
 
 
+def test_a_resume_that_the_loop_refuses_leaves_the_settings(capsys, loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    checkpoint_of(out, 200)
+    before = (out / "config.json").read_bytes()
+    longer = [f"--config={out}/config.json", "--steps=900", f"--out={out}", "--resume=auto"]
+    with monkeypatch.context() as patch:
+
+        def refuse(config, out, **_):
+            raise ConfigError("metrics.jsonl: does not begin with the rows that the checkpoint knows")
+
+        patch.setattr(loop, "train", refuse)
+        with pytest.raises(SystemExit):
+            train_in_process(*longer)
+    assert "error: metrics.jsonl: does not begin" in capsys.readouterr().err
+    assert (out / "config.json").read_bytes() == before
+    train_in_process(*longer)
+    assert Config.load(out).steps == 900
+
+
 def test_a_run_goes_on_without_the_one_that_it_started_from(capsys, loop, tmp_path):
     pre, out = tmp_path / "pre", tmp_path / "run"
     objective = "--objective=reconstruction"

@@ -39,6 +39,11 @@ def make(path, config=CONFIG, checkpoints=(), ended=False, reached=None):
     return made
 
 
+def go_on(path, made, wanted):
+    with going_on(path, made, wanted) as begun:
+        begun()
+
+
 def everything(path):
     return {p: p.read_bytes() for p in path.rglob("*") if p.is_file()}
 
@@ -121,6 +126,8 @@ def test_a_run_is_extended_and_says_what_depends_on_its_end(tmp_path, capsys):
     assert f"--steps was {CONFIG.steps} and is {CONFIG.steps + 5}" in line and "learning rates" not in line
     with going_on(run, made, longer):
         pass
+    assert Config.load(run) == CONFIG  # it has not begun
+    go_on(run, made, longer)
     said = json.loads((run / "config.json").read_text())
     assert Config.load(run) == longer and said["continued"][-1]["settings"] == {"steps": longer.steps}
     with pytest.raises(ConfigError, match="^--steps=99: the run in .* has done 100 env steps already"):
@@ -142,8 +149,7 @@ def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
     (made,) = make(run, checkpoints=(100,))
     began = json.loads((run / "config.json").read_text())
     assert to_resume(run, CONFIG) == made
-    with going_on(run, made, made.config):
-        pass
+    go_on(run, made, made.config)
     assert capsys.readouterr().err == "" and json.loads((run / "config.json").read_text()) == began
 
     there = {name: version for name, version in began["versions"].items() if name != "numpy"}
@@ -159,8 +165,10 @@ def test_what_has_changed_since_is_said_and_kept(tmp_path, monkeypatch, capsys):
         f"was '--a' and is '--b', cpus was 99 and is {cpus}, numpy was None and is {numpy!r}, NPROC was None "
         "and is '3': results may differ from those of a run that did not end\n"
     )
-    with going_on(run, made, made.config), pytest.raises(ConfigError, match="is writing there"):
-        to_resume(run, CONFIG)
+    with going_on(run, made, made.config) as begun:
+        begun()
+        with pytest.raises(ConfigError, match="is writing there"):
+            to_resume(run, CONFIG)
     said = json.loads((run / "config.json").read_text())
     assert said["versions"]["jax"] == "0.1" and Config.load(run) == CONFIG
     (continued,) = said["continued"]
@@ -193,8 +201,7 @@ def test_an_imported_file_that_has_changed_is_said_and_kept(tmp_path, capsys):
     assert to_resume(run, wanted) == made
     said = f"resume: {run}: mine.py was {then!r} and is {now!r}: results may differ from those of a run that"
     assert capsys.readouterr().err == f"{said} did not end\n"
-    with going_on(run, made, wanted):
-        pass
+    go_on(run, made, wanted)
     (continued,) = json.loads((run / "config.json").read_text())["continued"]
     assert continued["changed"] == {"mine.py": now}
     assert to_resume(run, wanted) == made and capsys.readouterr().err == ""
