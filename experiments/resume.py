@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from srl_jax.errors import ConfigError
+from srl_jax.files.rundir import put_back
 
 from . import train
 from .command_line import flags as config_flags
@@ -28,6 +29,7 @@ def command_line(run: str) -> list[str]:
         ConfigError: it is neither.
     """
     path = Path(os.path.expanduser(run))
+    put_back(path)
     goes_on = [f"--out={run}", "--resume=auto"]
     if (path / "config.json").is_file():
         return [f"--config={path / 'config.json'}", *goes_on]

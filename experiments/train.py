@@ -20,7 +20,7 @@ from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
 from srl_jax.files.resuming import all_to_resume, blank, going_on, has_ended, is_run, say, say_anew
-from srl_jax.files.rundir import check_free, run_directory
+from srl_jax.files.rundir import check_free, put_back, run_directory
 from srl_jax.training import check_game, check_sources, completed, resolved
 
 from .command_line import flags as config_flags
@@ -62,7 +62,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
 
 
 def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:
-    """Whether a run can be written there; writes nothing.
+    """Whether a run can be written there; writes nothing, but for `put_back`.
 
     Args:
         out: the path, or None where it was not given.
@@ -81,6 +81,8 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
     if overwrite and resume:
         raise ConfigError("--resume=auto: resumes the run that --overwrite deletes; give one of them")
     path = paths.check_place("out", out)
+    for directory in (path, *path.glob("seed*")):
+        put_back(directory)
     try:
         problem = "" if blank(path) else _why_not(path, config, overwrite, resume)
     except OSError as error:
@@ -232,9 +234,10 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         started = contextlib.ExitStack()  # what is to be done once the run has begun
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
             if manifest:
-                started.callback(stack.enter_context(going_on(directory, manifest, its_config)))
+                begun = stack.enter_context(going_on(directory, manifest, its_config))
             else:
-                stack.enter_context(run_directory(directory, its_config))
+                begun = stack.enter_context(run_directory(directory, its_config))
+            started.callback(begun)
         caught = stack.enter_context(signals(again=interrupt))
         directories = [directory for directory, _ in runs]
         resumed = manifests if manifests[0] else None

@@ -43,8 +43,8 @@ def blank(path: Path) -> bool:
     def left(entry: Path) -> bool:
         if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
             return blank(entry)
-        if entry.name in (rundir.LOCK, f"{config.FILE}.partial"):
-            return True
+        if entry.name in (rundir.LOCK, f"{config.FILE}.partial") or entry.name.startswith(rundir.ASIDE):
+            return True  # `rundir.put_back` is for what was set aside, before anybody asks
         if entry.is_symlink() or not begun:
             return False
         if entry.name == "encoders":  # what diagnostics keep of the first evaluation

@@ -101,6 +101,23 @@ def test_a_config_that_the_loop_refuses_leaves_nothing(capsys, loop, tmp_path, m
     assert list((tmp_path / "empty").iterdir()) == []
 
 
+def test_overwriting_that_the_loop_refuses_leaves_the_old_run(capsys, loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    (out / "metrics.jsonl").write_text("{}")
+    checkpoint_of(out, 200)
+
+    def refuse(config, out, **_):
+        assert not (out / "metrics.jsonl").exists()  # it would append to the old one's
+        (out / "metrics.jsonl").touch()
+        raise ConfigError("--buffer_size=70: capacity must be at least 90")
+
+    monkeypatch.setattr(loop, "train", refuse)
+    before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file())
+    assert "--buffer_size=70" in refused(capsys, "--seed=3", "--overwrite", f"--out={out}")
+    assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file()) == before
+
+
 def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
     out = tmp_path / "run"
     resume = [*CATCH, f"--out={out}", "--resume=auto"]
