@@ -42,7 +42,7 @@ def blank(path: Path) -> bool:
 
     def left(entry: Path) -> bool:
         if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
-            return blank(entry)
+            return blank(entry) and rundir.is_free(entry)
         if entry.name in (rundir.LOCK, f"{config.FILE}.partial") or entry.name.startswith(rundir.ASIDE):
             return True  # `rundir.put_back` is for what was set aside, before anybody asks
         if entry.is_symlink() or not begun:
@@ -68,8 +68,13 @@ def say_anew(path: Path) -> None:
 
 
 def is_run(path: Path) -> bool:
-    """Whether the directory, or one of seeds in it, holds a config.json that this program wrote."""
-    return any(map(_is_config, (path / config.FILE, *sorted(path.glob(f"seed*/{config.FILE}")))))
+    """Whether the directory holds a config.json that this program wrote."""
+    return _is_config(path / config.FILE)
+
+
+def has_seeds(path: Path) -> bool:
+    """Whether one of the directories of seeds in a directory is a run's."""
+    return any(map(is_run, sorted(path.glob("seed*"))))
 
 
 def _is_config(file: Path) -> bool:

@@ -40,6 +40,15 @@ def check_free(run: Path) -> None:
         os.close(descriptor)
 
 
+def is_free(run: Path) -> bool:
+    """Whether no process holds a run directory; writes nothing."""
+    try:
+        check_free(run)
+    except ConfigError:
+        return False
+    return True
+
+
 @contextlib.contextmanager
 def held(run: Path) -> Iterator[None]:
     """Holds a run directory, which exists, for this process.
@@ -82,7 +91,7 @@ def held(run: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def run_directory(path: Path, config: Config) -> Iterator[Callable[[], None]]:
+def run_directory(path: Path, config: Config | None) -> Iterator[Callable[[], None]]:
     """Makes the run directory with its config.json, and yields what deletes the run that lay there before.
 
     That is called once the new run has begun; until then the old one is set aside, in `ASIDE`. It comes back
@@ -91,10 +100,10 @@ def run_directory(path: Path, config: Config) -> Iterator[Callable[[], None]]:
 
     Args:
         path: of a directory that may be made, or may be emptied: a run that lies there is deleted.
-        config: resolved; written to config.json.
+        config: resolved; written to config.json. None: the directory is for those of several seeds.
 
     Raises:
-        ConfigError: it cannot be made, or another process writes there.
+        ConfigError: it cannot be made, or another process writes there, or to a seed's directory in it.
         SaveError: config.json could not be written, or by what is yielded: the old run cannot be deleted.
     """
     made, under_way = [], False
@@ -116,10 +125,13 @@ def run_directory(path: Path, config: Config) -> Iterator[Callable[[], None]]:
         except OSError as error:
             raise ConfigError(f"--out={path}: {error.strerror}") from None
         with held(path):
+            for seed in path.glob("seed*"):
+                check_free(seed)
             try:
                 try:
                     _set_aside(path)
-                    config.save(path)
+                    if config is not None:
+                        config.save(path)
                 except OSError as error:
                     raise SaveError(f"--out={path}: {error.strerror}") from None
                 yield begun

@@ -58,24 +58,6 @@ def test_a_directory_with_files_is_kept(capsys, loop, tmp_path):
     assert loop.calls == []
 
 
-def test_overwrite_replaces_a_run_but_not_what_it_starts_from(capsys, loop, tmp_path, monkeypatch):
-    out = tmp_path / "run"
-    train_in_process("--game=Catch", f"--out={out}")
-    (out / "metrics.jsonl").write_text("{}")
-    (out / "checkpoints").mkdir()
-    start = ["--mode=finetuned", f"--encoder_from={out}/checkpoints"]
-    line = refused(capsys, f"--out={out}", "--overwrite", *start)
-    assert "--overwrite would delete --encoder_from" in line
-    monkeypatch.chdir(out)
-    assert "working directory" in refused(capsys, f"--out={out}", "--overwrite")
-    monkeypatch.chdir(tmp_path)
-    assert (out / "metrics.jsonl").exists()
-    train_in_process("--game=Catch", "--seed=1", f"--out={out}", "--overwrite")
-    assert {path.name for path in out.iterdir()} == {"config.json", "metrics.jsonl"}
-    assert (out / "metrics.jsonl").read_text() == ""  # the new run's
-    assert Config.load(out).seed == 1
-
-
 def test_a_run_starts_with_its_config_written(loop, tmp_path):
     out = tmp_path / "runs" / "a"
     train_in_process(*JOINT, "--objective=latent_l2:weight=1e-6", f"--out={out}")
@@ -99,23 +81,6 @@ def test_a_config_that_the_loop_refuses_leaves_nothing(capsys, loop, tmp_path, m
     (tmp_path / "empty").mkdir()
     refused(capsys, f"--out={tmp_path}/empty")
     assert list((tmp_path / "empty").iterdir()) == []
-
-
-def test_overwriting_that_the_loop_refuses_leaves_the_old_run(capsys, loop, tmp_path, monkeypatch):
-    out = tmp_path / "run"
-    train_in_process(*CATCH, f"--out={out}")
-    (out / "metrics.jsonl").write_text("{}")
-    checkpoint_of(out, 200)
-
-    def refuse(config, out, **_):
-        assert not (out / "metrics.jsonl").exists()  # it would append to the old one's
-        (out / "metrics.jsonl").touch()
-        raise ConfigError("--buffer_size=70: capacity must be at least 90")
-
-    monkeypatch.setattr(loop, "train", refuse)
-    before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file())
-    assert "--buffer_size=70" in refused(capsys, "--seed=3", "--overwrite", f"--out={out}")
-    assert sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file()) == before
 
 
 def test_a_run_goes_on_from_its_checkpoint_or_begins(capsys, loop, tmp_path):
