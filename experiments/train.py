@@ -29,6 +29,7 @@ from srl_jax.files.resuming import (
     is_run,
     say,
     say_anew,
+    say_finished,
 )
 from srl_jax.files.rundir import LOCK, check_free, put_back, run_directory
 from srl_jax.training import check_game, check_sources, completed, resolved
@@ -236,7 +237,11 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs, completed) if resume else [None] * len(runs)
     if all(m and has_ended(where, m, c) for (where, c), m in zip(runs, manifests, strict=True)):
-        print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
+        late = not dry and any(
+            [say_finished(where, m) for (where, _), m in zip(runs, manifests, strict=True)]
+        )
+        beside = "; it was killed before ended.json said so, which it does now" if late else ""
+        print(f"the run in {path} has ended: {manifests[0].env_steps} env steps{beside}")
         return 0
     # A checkpoint has the encoder; the policy that others are pretrained on is read again.
     needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config

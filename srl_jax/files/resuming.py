@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -262,6 +263,35 @@ def has_ended(path: Path, manifest: Manifest, wanted: Config) -> bool:
     ended = ending.read(path)  # a run of --keep_replay
     over = manifest.env_steps >= wanted.steps or not difference(manifest.config, wanted, ENDS)
     return over and ended is not None and ended.status == "finished"
+
+
+def lacks(path: Path, found: Manifest) -> str:
+    """What is missing of a run that has ended, as its last checkpoint says, or ""."""
+    try:
+        if (found.path / checkpoint.PARAMS).stat().st_size != found.files[checkpoint.PARAMS].bytes:
+            return f"{checkpoint.PARAMS} has not the size that the manifest knows"
+        with open(path / "metrics.jsonl", "rb") as file:
+            file.seek(-1, os.SEEK_END)
+            return "" if file.read(1) == b"\n" else "the last row of metrics.jsonl is cut short"
+    except OSError as error:
+        return f"{os.path.basename(error.filename or 'metrics.jsonl')}: {error.strerror}"
+
+
+def say_finished(path: Path, manifest: Manifest) -> bool:
+    """Whether a run that `has_ended` was ended before its ended.json said so; the file says so now.
+
+    Raises:
+        ConfigError: another process writes there.
+        SaveError: it could not be written.
+    """
+    with contextlib.suppress(ConfigError):  # one that is damaged says nothing
+        if (ended := ending.read(path)) is not None and ended.status == "finished":
+            return False
+    if lacks(path, manifest):
+        return False
+    with rundir.held(path):
+        ending.write(path, ending.Ending("finished", manifest.env_steps))
+    return True
 
 
 def first_checkpoint(wanted: Config) -> int:

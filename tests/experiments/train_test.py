@@ -16,6 +16,7 @@ from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint, rundir
 from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.run import ending
 from tests.helpers import SMALL
 from tests.in_process import CATCH, ROOT, checkpoint_of, refused, train_in_process
 
@@ -217,7 +218,22 @@ def test_a_run_that_has_ended_says_so(capsys, loop, tmp_path):
     checkpoint_of(out, 500, ended=True)
     capsys.readouterr()
     assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
-    assert capsys.readouterr().out == f"the run in {out} has ended: 500 env steps\n"
+    line = f"the run in {out} has ended: 500 env steps"
+    assert capsys.readouterr().out == f"{line}\n" and ending.read(out) is None  # its rows are not there
+    # One that was killed, or told to end twice, while it drew pictures.
+    (out / "metrics.jsonl").write_text('{"kind": "eval", "env_steps": 500}\n')
+    for ended in (None, ending.Ending("stopped", 500)):
+        if ended is not None:
+            ending.write(out, ended)
+        assert train_in_process(*CATCH, f"--out={out}", "--resume=auto", "--dry_run") == 0
+        assert capsys.readouterr().out == f"{line}\n" and ending.read(out) == ended
+        assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
+        late = "; it was killed before ended.json said so, which it does now\n"
+        assert capsys.readouterr().out == line + late and ending.read(out) == ("finished", 500, "")
+        (out / "ended.json").unlink()
+    (out / "ended.json").write_text("{")
+    assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
+    assert ending.read(out) == ("finished", 500, "") and not (out / "lock").exists()
     assert len(loop.calls) == 1
 
 
