@@ -1,8 +1,8 @@
 """Resumes a run that was stopped or killed: `python -m experiments.resume runs/x`.
 
 The run's config.json has all settings. These flags may follow: --steps, which also extends a run that has
-ended if it was trained with --keep_replay; --stop_at_return; --policy_from of a run that lies elsewhere;
---import; and --tune_runtime.
+ended if it was trained with --keep_replay; --stop_at_return; --keep_replay; --keep_best; --logger; --import;
+--encoder_from and --policy_from of runs that lie elsewhere; and --tune_runtime.
 """
 
 import os

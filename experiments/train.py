@@ -21,6 +21,7 @@ from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
 from srl_jax.files.resuming import (
+    MAY_CHANGE,
     all_to_resume,
     blank,
     going_on,
@@ -237,6 +238,10 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs, completed) if resume else [None] * len(runs)
     if all(m and has_ended(where, m, c) for (where, c), m in zip(runs, manifests, strict=True)):
+        there, given = Config.load(runs[0][0]), config_flags.given_fields(values)
+        for name in MAY_CHANGE:
+            if name in given and getattr(there, name) != getattr(config, name):
+                say(f"--{INFOS[name].flag or name}: changes nothing, the run has ended")
         late = not dry and any(
             [say_finished(where, m) for (where, _), m in zip(runs, manifests, strict=True)]
         )

@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,10 +13,11 @@ import types
 import pytest
 
 from experiments import resume, train
-from srl_jax.config import Config
+from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint, rundir
 from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.files.resuming import MAY_CHANGE
 from srl_jax.run import ending
 from tests.helpers import SMALL
 from tests.in_process import CATCH, ROOT, checkpoint_of, refused, train_in_process
@@ -235,6 +237,24 @@ def test_a_run_that_has_ended_says_so(capsys, loop, tmp_path):
     assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
     assert ending.read(out) == ("finished", 500, "") and not (out / "lock").exists()
     assert len(loop.calls) == 1
+
+
+def test_a_run_that_has_ended_says_which_flags_come_too_late(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    checkpoint_of(out, 500, ended=True)
+    line = resume.command_line(str(out))
+    capsys.readouterr()
+    assert train_in_process(*line, "--steps=500", "--nokeep_replay") == 0 and capsys.readouterr().err == ""
+    assert train_in_process(*line, "--logger=csv", "--nokeep_best") == 0
+    said = sorted(capsys.readouterr().err.splitlines())
+    late = ": changes nothing, the run has ended"
+    assert said == [f"resume: --keep_best{late}", f"resume: --logger{late}"]
+
+
+def test_the_help_of_resume_names_each_flag_that_may_follow():
+    flags = [INFOS[name].flag or name for name in (*MAY_CHANGE, *SOURCES)]
+    assert [flag for flag in flags if not re.search(rf"--{flag}\b", resume.__doc__)] == []
 
 
 def test_seeds_go_on_together(capsys, loop, tmp_path):
