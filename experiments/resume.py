@@ -1,8 +1,8 @@
 """Resumes a run that was stopped or killed: `python -m experiments.resume runs/x`.
 
 The run's config.json has all settings. These flags may follow: --steps, which also extends a run that has
-ended if it was trained with --keep_replay; --stop_at_return; --policy_from of a run that lies elsewhere;
---import; and --tune_runtime.
+ended if it was trained with --keep_replay; --stop_at_return; --keep_replay; --keep_best; --logger; --import;
+--encoder_from and --policy_from of runs that lie elsewhere; and --tune_runtime.
 """
 
 import os
@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 from srl_jax.errors import ConfigError
+from srl_jax.files.rundir import put_back
 
 from . import train
 from .command_line import flags as config_flags
@@ -28,6 +29,7 @@ def command_line(run: str) -> list[str]:
         ConfigError: it is neither.
     """
     path = Path(os.path.expanduser(run))
+    put_back(path)
     goes_on = [f"--out={run}", "--resume=auto"]
     if (path / "config.json").is_file():
         return [f"--config={path / 'config.json'}", *goes_on]

@@ -9,8 +9,9 @@ import contextlib
 import dataclasses
 import functools
 import os
+import re
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from absl import flags
@@ -19,8 +20,19 @@ from srl_jax import envs
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import display
-from srl_jax.files.resuming import all_to_resume, blank, going_on, has_ended, is_run, say, say_anew
-from srl_jax.files.rundir import check_free, run_directory
+from srl_jax.files.resuming import (
+    MAY_CHANGE,
+    all_to_resume,
+    blank,
+    going_on,
+    has_ended,
+    has_seeds,
+    is_run,
+    say,
+    say_anew,
+    say_finished,
+)
+from srl_jax.files.rundir import LOCK, check_free, put_back, run_directory
 from srl_jax.training import check_game, check_sources, completed, resolved
 
 from .command_line import flags as config_flags
@@ -61,14 +73,17 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     )
 
 
-def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool) -> Path:
-    """Whether a run can be written there; writes nothing.
+def check_out(
+    out: str | None, config: Config, *, overwrite: bool, resume: bool, seeds: Sequence[int] = ()
+) -> Path:
+    """Whether a run can be written there; writes nothing, but for `put_back`.
 
     Args:
         out: the path, or None where it was not given.
         config: what it starts from must not be deleted.
         overwrite: a run that lies there may be deleted.
         resume: whether a run that lies there will be resumed.
+        seeds: of --seeds, whose directories are made in it.
 
     Returns:
         The path.
@@ -81,8 +96,13 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
     if overwrite and resume:
         raise ConfigError("--resume=auto: resumes the run that --overwrite deletes; give one of them")
     path = paths.check_place("out", out)
+    its_seeds = sorted(path.glob("seed*"))
+    for directory in (path, *([path / f"seed{seed}" for seed in seeds] if resume else its_seeds)):
+        check_free(directory)
+    for directory in (path, *its_seeds):
+        put_back(directory)
     try:
-        problem = "" if blank(path) else _why_not(path, config, overwrite, resume)
+        problem = "" if blank(path) else _why_not(path, config, overwrite, resume, bool(seeds))
     except OSError as error:
         problem = str(error.strerror)
     if problem:
@@ -90,16 +110,28 @@ def check_out(out: str | None, config: Config, *, overwrite: bool, resume: bool)
     return path
 
 
-def _why_not(path: Path, config: Config, overwrite: bool, resume: bool) -> str:
+def _why_not(path: Path, config: Config, overwrite: bool, resume: bool, seeds: bool) -> str:
     """Why a directory in which something lies cannot be resumed or deleted; "" where it can."""
+    single, several = is_run(path), has_seeds(path)
     if resume:
-        return "" if is_run(path) else "not a run directory, so --resume=auto cannot resume it"
+        if not (single or several):
+            return "not a run directory, so --resume=auto cannot resume it"
+        if single and seeds:
+            return "a single run lies there, which --seeds does not resume; name another directory"
+        if not (single or seeds):
+            return "runs of several seeds lie there; give their --seeds, or name another directory"
+        return ""
     if not overwrite:
         return "not empty; name a new directory, or --resume=auto resumes the run, or --overwrite deletes it"
     if path.is_symlink():
         return "a link, so --overwrite does not delete it; name what it leads to"
-    if not is_run(path):
+    if not (single or several):
         return "not a run directory, so --overwrite does not delete it"
+    others = [e.name for e in path.iterdir() if not re.fullmatch(rf"seed\d+|{LOCK}", e.name)]
+    if not single and others:
+        return (
+            f"{min(others)} lies beside the runs of seeds, so --overwrite does not delete them; move it away"
+        )
     for flag in SOURCES:
         source = getattr(config, flag)
         if source and Path(source).resolve().is_relative_to(path.resolve()):
@@ -187,9 +219,9 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         return 0
     seeds = check_seeds(values)
     resume = values["resume"].value == "auto"
-    path = check_out(values["out"].value, config, overwrite=values["overwrite"].value, resume=resume)
-    for directory in [path / f"seed{seed}" for seed in seeds] or [path]:
-        check_free(directory)
+    overwrite = values["overwrite"].value
+    path = check_out(values["out"].value, config, overwrite=overwrite, resume=resume, seeds=seeds)
+    fresh = not resume or blank(path)  # whatever lies there makes way
     check_extras(config)
     if not resume:
         check_paths(config)
@@ -206,7 +238,15 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     runs = runs or [(path, config)]
     manifests = all_to_resume(runs, completed) if resume else [None] * len(runs)
     if all(m and has_ended(where, m, c) for (where, c), m in zip(runs, manifests, strict=True)):
-        print(f"the run in {path} has ended: {manifests[0].env_steps} env steps")
+        there, given = Config.load(runs[0][0]), config_flags.given_fields(values)
+        for name in MAY_CHANGE:
+            if name in given and getattr(there, name) != getattr(config, name):
+                say(f"--{INFOS[name].flag or name}: changes nothing, the run has ended")
+        late = not dry and any(
+            [say_finished(where, m) for (where, _), m in zip(runs, manifests, strict=True)]
+        )
+        beside = "; it was killed before ended.json said so, which it does now" if late else ""
+        print(f"the run in {path} has ended: {manifests[0].env_steps} env steps{beside}")
         return 0
     # A checkpoint has the encoder; the policy that others are pretrained on is read again.
     needed = dataclasses.replace(config, encoder_from="") if manifests[0] else config
@@ -222,23 +262,32 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
             how = f"would resume from {manifest.env_steps} env steps" if manifest else "would begin"
             display.say(f"dry run: nothing is written; a run {how} in {directory}")
         return 0
-    if not resume and not values["overwrite"].value:
+    if not resume and not overwrite:
         for directory, _ in runs:
             say_anew(directory)
     if manifests[0]:
         say(f"{path}: resumed from {manifests[0].env_steps:,} env steps")
     say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
+        started = contextlib.ExitStack()  # what is to be done once the run has begun
+        if seeds and fresh:
+            started.callback(stack.enter_context(run_directory(path, None)))
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):
             if manifest:
-                stack.enter_context(going_on(directory, manifest, its_config))
+                begun = stack.enter_context(going_on(directory, manifest, its_config))
             else:
-                stack.enter_context(run_directory(directory, its_config))
+                begun = stack.enter_context(run_directory(directory, its_config))
+            started.callback(begun)
         caught = stack.enter_context(signals(again=interrupt))
         directories = [directory for directory, _ in runs]
         resumed = manifests if manifests[0] else None
         results = loop.train_seeds(
-            config, seeds or [config.seed], directories, resume=resumed, stop=lambda: bool(caught)
+            config,
+            seeds or [config.seed],
+            directories,
+            resume=resumed,
+            stop=lambda: bool(caught),
+            begun=started.close,
         )
         draw([directory for directory, _ in runs], [config for _, config in runs], results)
     if any(result.interrupted for result in results):

@@ -54,8 +54,8 @@ def train(config: Config, out: str | os.PathLike[str], *, progress: bool = True)
 
     from srl_jax.run import loop
 
-    with run_directory(path, full):
-        return loop.train(full, path, progress=progress)
+    with run_directory(path, full) as begun:
+        return loop.train(full, path, progress=progress, begun=begun)
 
 
 def check_game(config: Config, imported: bool = False) -> None:

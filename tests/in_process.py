@@ -30,10 +30,13 @@ class Loop(types.ModuleType):
         self.resumed = []
         self.seeds = []
 
-    def train_seeds(self, config, seeds, outs, *, resume, stop):
+    def train_seeds(self, config, seeds, outs, *, resume, stop, begun):
         self.seeds.append(seeds)
         manifests = resume or [None] * len(outs)
-        return [self.train(config, out, resume=m, stop=stop) for out, m in zip(outs, manifests, strict=True)]
+        runs = zip(outs, manifests, strict=True)
+        results = [self.train(config, out, resume=m, stop=stop) for out, m in runs]
+        begun()  # what refuses comes before
+        return results
 
     def train(self, config, out, *, resume=None, stop):
         assert not stop()

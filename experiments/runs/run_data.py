@@ -12,6 +12,7 @@ from srl_jax.config import Config
 from srl_jax.diagnostics.drift import STEPS, drift_matrix, drift_names
 from srl_jax.errors import ConfigError
 from srl_jax.files.metrics import KINDS, read_metrics
+from srl_jax.files.rundir import ASIDE
 from srl_jax.run import ending
 from srl_jax.run.ending import Ending
 from srl_jax.specs import LIMITS
@@ -134,13 +135,14 @@ def natural(text: str) -> list:
 
 
 def run_directories(root: Path) -> list[Path]:
-    """The run directories in or below another, without what was moved aside as broken.
+    """The run directories in or below another, without what was moved aside as broken or to be overwritten.
 
     Raises:
         ConfigError: a directory cannot be read.
     """
     below = runs_below(root)
-    return [path for path in below if not any(".broken-" in part for part in path.relative_to(root).parts)]
+    aside = re.compile(rf"\.broken-|^{re.escape(ASIDE)}")
+    return [path for path in below if not any(map(aside.search, path.relative_to(root).parts))]
 
 
 def read_rows(path: Path) -> list[dict]:

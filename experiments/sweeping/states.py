@@ -16,7 +16,7 @@ from typing import NamedTuple
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files import checkpoint, resuming, rundir
-from srl_jax.files.checkpoint import NUMBERS, PARAMS
+from srl_jax.files.checkpoint import NUMBERS
 from srl_jax.run import ending
 
 from .manifest import Entry
@@ -77,7 +77,7 @@ def look(path: Path, config: Config) -> State:
     over = NUMBERS not in found.files or (ended is not None and ended.status == "finished")  # --keep_replay
     if not over or _alike(resuming.another_run, found.config, config):
         return State("resumable", found.env_steps)
-    lacks = _lacks(path, found)
+    lacks = resuming.lacks(path, found)
     return State("resumable" if lacks else "done", found.env_steps, lacks)
 
 
@@ -93,19 +93,6 @@ def _alike(differing: Callable[..., str], there: Config, here: Config, *names: I
 def holder(error: ConfigError) -> str:
     """Which process holds a directory, from the line of `rundir.check_free`."""
     return str(error).partition(": ")[2].partition(" is writing")[0]
-
-
-def _lacks(path: Path, found: checkpoint.Manifest) -> str:
-    """What is missing of a run that has ended, or ""."""
-    try:
-        if (found.path / PARAMS).stat().st_size != found.files[PARAMS].bytes:
-            return f"{PARAMS} has not the size that the manifest knows"
-        with open(path / "metrics.jsonl", "rb") as file:
-            size = file.seek(0, os.SEEK_END)  # 0 of a run that was too short for a row
-            file.seek(max(size - 1, 0))
-            return "" if file.read(1) in (b"\n", b"") else "the last row of metrics.jsonl is cut short"
-    except OSError as error:
-        return f"{os.path.basename(error.filename or 'metrics.jsonl')}: {error.strerror}"
 
 
 def look_at_all(root: Path, entries: Mapping[str, Entry]) -> dict[str, State]:

@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -42,9 +43,9 @@ def blank(path: Path) -> bool:
 
     def left(entry: Path) -> bool:
         if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
-            return blank(entry)
-        if entry.name in (rundir.LOCK, f"{config.FILE}.partial"):
-            return True
+            return blank(entry) and rundir.is_free(entry)
+        if entry.name in (rundir.LOCK, f"{config.FILE}.partial") or entry.name.startswith(rundir.ASIDE):
+            return True  # `rundir.put_back` is for what was set aside, before anybody asks
         if entry.is_symlink() or not begun:
             return False
         if entry.name == "encoders":  # what diagnostics keep of the first evaluation
@@ -68,8 +69,13 @@ def say_anew(path: Path) -> None:
 
 
 def is_run(path: Path) -> bool:
-    """Whether the directory, or one of seeds in it, holds a config.json that this program wrote."""
-    return any(map(_is_config, (path / config.FILE, *sorted(path.glob(f"seed*/{config.FILE}")))))
+    """Whether the directory holds a config.json that this program wrote."""
+    return _is_config(path / config.FILE)
+
+
+def has_seeds(path: Path) -> bool:
+    """Whether one of the directories of seeds in a directory is a run's."""
+    return any(map(is_run, sorted(path.glob("seed*"))))
 
 
 def _is_config(file: Path) -> bool:
@@ -184,11 +190,11 @@ def _changes(path: Path, about: dict, wanted: Config) -> dict[str, tuple]:
 
 
 @contextlib.contextmanager
-def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[None]:
-    """Holds the directory of a run that is resumed, whose config.json is brought up to date.
+def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[Callable[[], None]]:
+    """Holds the directory of a run that is resumed, and yields what brings its config.json up to date.
 
-    The settings of `MAY_CHANGE` take their new values; what else has changed is under "continued". Where
-    nothing has, nothing is written.
+    That is called once the run has begun: what is refused changes nothing. The settings of `MAY_CHANGE` take
+    their new values; what else has changed is under "continued". Where nothing has, nothing is written.
 
     Args:
         path: the directory.
@@ -197,19 +203,22 @@ def going_on(path: Path, manifest: Manifest, resumed: Config) -> Iterator[None]:
 
     Raises:
         ConfigError: another process writes there.
-        SaveError: config.json could not be written.
+        SaveError: by what is yielded: config.json could not be written.
     """
     with rundir.held(path):
         there, about = config.read(path)
         values = {name: getattr(resumed, name) for name in MAY_CHANGE}
         settings = {name: value for name, value in values.items() if getattr(there, name) != value}
         changed = {name: now for name, (_, now) in _changes(path, about, resumed).items()}
-        if settings or changed:
-            now = {"env_steps": manifest.env_steps, "started": provenance.now()}
-            continued = [*about.get("continued", []), {**now, "changed": changed, "settings": settings}]
-            with saving(f"--out={path}"):
-                config.write(path, {**about, **settings, "continued": continued})
-        yield
+
+        def begun() -> None:
+            if settings or changed:
+                now = {"env_steps": manifest.env_steps, "started": provenance.now()}
+                continued = [*about.get("continued", []), {**now, "changed": changed, "settings": settings}]
+                with saving(f"--out={path}"):
+                    config.write(path, {**about, **settings, "continued": continued})
+
+        yield begun
 
 
 def all_to_resume(
@@ -254,6 +263,36 @@ def has_ended(path: Path, manifest: Manifest, wanted: Config) -> bool:
     ended = ending.read(path)  # a run of --keep_replay
     over = manifest.env_steps >= wanted.steps or not difference(manifest.config, wanted, ENDS)
     return over and ended is not None and ended.status == "finished"
+
+
+def lacks(path: Path, found: Manifest) -> str:
+    """What is missing of a run that has ended, as its last checkpoint says, or ""."""
+    try:
+        if (found.path / checkpoint.PARAMS).stat().st_size != found.files[checkpoint.PARAMS].bytes:
+            return f"{checkpoint.PARAMS} has not the size that the manifest knows"
+        with open(path / "metrics.jsonl", "rb") as file:
+            size = file.seek(0, os.SEEK_END)  # 0 of a run that was too short for a row
+            file.seek(max(size - 1, 0))
+            return "" if file.read(1) in (b"\n", b"") else "the last row of metrics.jsonl is cut short"
+    except OSError as error:
+        return f"{os.path.basename(error.filename or 'metrics.jsonl')}: {error.strerror}"
+
+
+def say_finished(path: Path, manifest: Manifest) -> bool:
+    """Whether a run that `has_ended` was ended before its ended.json said so; the file says so now.
+
+    Raises:
+        ConfigError: another process writes there.
+        SaveError: it could not be written.
+    """
+    with contextlib.suppress(ConfigError):  # one that is damaged says nothing
+        if (ended := ending.read(path)) is not None and ended.status == "finished":
+            return False
+    if lacks(path, manifest):
+        return False
+    with rundir.held(path):
+        ending.write(path, ending.Ending("finished", manifest.env_steps))
+    return True
 
 
 def first_checkpoint(wanted: Config) -> int:

@@ -1,4 +1,4 @@
-"""Run directories: how one is made, and the lock that gives it one writer at a time."""
+"""Run directories: how one is made or replaced, and the lock that gives it one writer at a time."""
 
 import contextlib
 import fcntl
@@ -8,14 +8,18 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from srl_jax.config import Config
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, SaveError, saving
 from srl_jax.files import display
 
 LOCK = "lock"
+ASIDE = ".overwritten"
+"""What lay in a run directory, until the run that replaces it has begun."""
+MOVING, GONE = f"{ASIDE}.moving", f"{ASIDE}.deleted"
+"""The same, on its way there or back, and once nobody needs it."""
 
 
 def check_free(run: Path) -> None:
@@ -34,6 +38,15 @@ def check_free(run: Path) -> None:
         raise _refusal(run, descriptor) from None
     finally:
         os.close(descriptor)
+
+
+def is_free(run: Path) -> bool:
+    """Whether no process holds a run directory; writes nothing."""
+    try:
+        check_free(run)
+    except ConfigError:
+        return False
+    return True
 
 
 @contextlib.contextmanager
@@ -78,18 +91,31 @@ def held(run: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def run_directory(path: Path, config: Config) -> Iterator[None]:
-    """Makes the run directory with its config.json; unmakes it if what follows refuses the config.
+def run_directory(path: Path, config: Config | None) -> Iterator[Callable[[], None]]:
+    """Makes the run directory with its config.json, and yields what deletes the run that lay there before.
+
+    That is called once the new run has begun; until then the old one is set aside, in `ASIDE`. It comes back
+    if something ends the new run before: here, or in `put_back` where the process was killed. What was made
+    here goes again if what follows refuses the config.
 
     Args:
         path: of a directory that may be made, or may be emptied: a run that lies there is deleted.
-        config: resolved; written to config.json.
+        config: resolved; written to config.json. None: the directory is for those of several seeds.
 
     Raises:
-        ConfigError: it cannot be made, or another process writes there.
-        SaveError: config.json could not be written.
+        ConfigError: it cannot be made, or another process writes there, or to a seed's directory in it.
+        SaveError: config.json could not be written, or by what is yielded: the old run cannot be deleted.
     """
-    made, written = [], False
+    made, under_way = [], False
+
+    def begun() -> None:
+        nonlocal under_way
+        if (path / ASIDE).exists():
+            with saving(path / ASIDE, "not deleted"):
+                os.rename(path / ASIDE, path / GONE)
+            shutil.rmtree(path / GONE, ignore_errors=True)
+        under_way = True
+
     try:
         try:
             missing = [p for p in (path, *path.absolute().parents) if not p.exists()]
@@ -99,25 +125,73 @@ def run_directory(path: Path, config: Config) -> Iterator[None]:
         except OSError as error:
             raise ConfigError(f"--out={path}: {error.strerror}") from None
         with held(path):
+            for seed in path.glob("seed*"):
+                check_free(seed)
             try:
-                for old in path.iterdir():
-                    # The old config.json stays until the new one replaces it: it says that this is a run.
-                    if old.name not in (LOCK, "config.json"):
-                        shutil.rmtree(old) if old.is_dir() and not old.is_symlink() else old.unlink()
-                config.save(path)
-                written = True
-            except OSError as error:
-                raise SaveError(f"--out={path}: {error.strerror}") from None
-            yield
+                try:
+                    _set_aside(path)
+                    if config is not None:
+                        config.save(path)
+                except OSError as error:
+                    raise SaveError(f"--out={path}: {error.strerror}") from None
+                yield begun
+            except BaseException as error:
+                if not under_way:
+                    with contextlib.suppress(OSError):
+                        if not _restored(path) and isinstance(error, ConfigError):
+                            _empty(path, LOCK)
+                raise
+            begun()
     except ConfigError:
-        # Only what was made here goes: once anything else lies there, all of it stays.
-        with contextlib.suppress(OSError):
-            if written and [file.name for file in path.iterdir()] == ["config.json"]:
-                (path / "config.json").unlink()
         with contextlib.suppress(OSError):
             for directory in reversed(made):
                 directory.rmdir()
         raise
+
+
+def put_back(path: Path) -> None:
+    """Brings the run back that a killed process had set aside, see `run_directory`, and says so in a line.
+
+    Raises:
+        ConfigError: another process holds the directory.
+        SaveError: it cannot be brought back.
+    """
+    if any((path / name).exists() for name in (ASIDE, MOVING, GONE)):
+        with held(path), saving(path, "what was to be overwritten is not back"):
+            if _restored(path):
+                display.say(f"{path}: what lay there is back: the run that was to replace it never began")
+
+
+def _set_aside(path: Path) -> None:
+    """Moves what lies in a directory into its `ASIDE`, if anything does."""
+    _restored(path)
+    if not (entries := [entry for entry in path.iterdir() if entry.name not in (LOCK, GONE)]):
+        return
+    (path / MOVING).mkdir()
+    for entry in entries:
+        os.rename(entry, path / MOVING / entry.name)
+    os.rename(path / MOVING, path / ASIDE)
+
+
+def _restored(path: Path) -> bool:
+    """Whether anything was set aside; it is where it was then. Can be done again, wherever it was killed."""
+    shutil.rmtree(path / GONE, ignore_errors=True)
+    if (path / ASIDE).exists():  # all of it: what else lies there is the new run's
+        _empty(path, LOCK, ASIDE)
+        os.rename(path / ASIDE, path / MOVING)
+    if not (path / MOVING).exists():
+        return False
+    for entry in (path / MOVING).iterdir():
+        os.rename(entry, path / entry.name)
+    (path / MOVING).rmdir()
+    return True
+
+
+def _empty(path: Path, *but: str) -> None:
+    """Deletes what lies in a directory, but for what has one of these names."""
+    for entry in path.iterdir():
+        if entry.name not in but:
+            shutil.rmtree(entry) if entry.is_dir() and not entry.is_symlink() else entry.unlink()
 
 
 def _lock(descriptor: int, how: int) -> str:

@@ -68,6 +68,7 @@ def train_seeds(
     progress: bool = True,
     resume: Sequence[Manifest] | None = None,
     stop: Callable[[], bool] = lambda: False,
+    begun: Callable[[], None] = lambda: None,
     agent: Agent | None = None,
 ) -> list[Result]:
     """Trains an agent of each seed, in step, writing rows and checkpoints into run directories.
@@ -85,6 +86,7 @@ def train_seeds(
             `checkpoint.verify`; what follows is what would have followed had the run not ended there.
         stop: asked before each step; once it says so, a checkpoint is written and training ends. A
             KeyboardInterrupt instead leaves the last checkpoint.
+        begun: called once nothing refuses the configuration any more, before the first step.
         agent: of this configuration, where it is made already.
 
     Raises:
@@ -96,7 +98,7 @@ def train_seeds(
     configs = [dataclasses.replace(config, seed=seed) for seed in seeds]
     try:
         run = Run(configs, paths, progress=progress, agent=agent, resume=resume, stop=stop)
-        results = run.train()
+        results = run.train(begun)
     except BaseException as error:
         if isinstance(error, ConfigError) and not (run and run.begun):
             raise
@@ -176,12 +178,15 @@ class Run:
         """The seeds, each with its own of a tree on the device."""
         return zip(self.seeds, self.device.parts(tree), strict=True)
 
-    def train(self) -> list[Result]:
-        """Runs to the end, or until it is told to stop."""
+    def train(self, begun: Callable[[], None] = lambda: None) -> list[Result]:
+        """Runs to the end, or until it is told to stop; `begun` as of `train_seeds`."""
         first, finished = self.seeds[0], False
         with self:
+            begun()
             for seed in self.seeds:
                 ending.clear(seed.out)
+                if seed.saved:
+                    saving.drop_after(seed.out, self.env_steps)
             self.begun = True
             try:
                 finished = self.run()

@@ -211,7 +211,6 @@ class Seed:
         Raises:
             ConfigError: the checkpoint is not of such a run, or the environments do not come back to what was
                 seen; names the file or says what differs.
-            SaveError: what is better than it and of a later step cannot be removed.
         """
         with saving.resumable(manifest):
             state = saving.restored(self.agent, manifest)
@@ -225,6 +224,5 @@ class Seed:
                 # One that was to be the last is not, where the run is extended.
                 if under_way.kind != FINAL or not difference(manifest.config, self.config, ENDS):
                     self.evaluations.under_way = under_way
-        saving.drop_after(self.out, manifest.env_steps)
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         return state

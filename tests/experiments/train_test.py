@@ -3,6 +3,7 @@
 import importlib.util
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -12,10 +13,12 @@ import types
 import pytest
 
 from experiments import resume, train
-from srl_jax.config import Config
+from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint, rundir
 from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.files.resuming import MAY_CHANGE
+from srl_jax.run import ending
 from tests.helpers import SMALL
 from tests.in_process import CATCH, ROOT, checkpoint_of, refused, train_in_process
 
@@ -56,24 +59,6 @@ def test_a_directory_with_files_is_kept(capsys, loop, tmp_path):
     assert "not a run directory" in refused(capsys, f"--out={tmp_path}", "--overwrite")
     assert [path.name for path in tmp_path.iterdir()] == ["config.json"]
     assert loop.calls == []
-
-
-def test_overwrite_replaces_a_run_but_not_what_it_starts_from(capsys, loop, tmp_path, monkeypatch):
-    out = tmp_path / "run"
-    train_in_process("--game=Catch", f"--out={out}")
-    (out / "metrics.jsonl").write_text("{}")
-    (out / "checkpoints").mkdir()
-    start = ["--mode=finetuned", f"--encoder_from={out}/checkpoints"]
-    line = refused(capsys, f"--out={out}", "--overwrite", *start)
-    assert "--overwrite would delete --encoder_from" in line
-    monkeypatch.chdir(out)
-    assert "working directory" in refused(capsys, f"--out={out}", "--overwrite")
-    monkeypatch.chdir(tmp_path)
-    assert (out / "metrics.jsonl").exists()
-    train_in_process("--game=Catch", "--seed=1", f"--out={out}", "--overwrite")
-    assert {path.name for path in out.iterdir()} == {"config.json", "metrics.jsonl"}
-    assert (out / "metrics.jsonl").read_text() == ""  # the new run's
-    assert Config.load(out).seed == 1
 
 
 def test_a_run_starts_with_its_config_written(loop, tmp_path):
@@ -160,6 +145,26 @@ def test_what_cannot_be_gone_on_with_is_refused(capsys, loop, tmp_path):
     assert len(loop.calls) == 1
 
 
+def test_a_resume_that_the_loop_refuses_leaves_the_settings(capsys, loop, tmp_path, monkeypatch):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    checkpoint_of(out, 200)
+    before = (out / "config.json").read_bytes()
+    longer = [f"--config={out}/config.json", "--steps=900", f"--out={out}", "--resume=auto"]
+    with monkeypatch.context() as patch:
+
+        def refuse(config, out, **_):
+            raise ConfigError("metrics.jsonl: does not begin with the rows that the checkpoint knows")
+
+        patch.setattr(loop, "train", refuse)
+        with pytest.raises(SystemExit):
+            train_in_process(*longer)
+    assert "error: metrics.jsonl: does not begin" in capsys.readouterr().err
+    assert (out / "config.json").read_bytes() == before
+    train_in_process(*longer)
+    assert Config.load(out).steps == 900
+
+
 def test_a_run_goes_on_without_the_one_that_it_started_from(capsys, loop, tmp_path):
     pre, out = tmp_path / "pre", tmp_path / "run"
     objective = "--objective=reconstruction"
@@ -215,8 +220,41 @@ def test_a_run_that_has_ended_says_so(capsys, loop, tmp_path):
     checkpoint_of(out, 500, ended=True)
     capsys.readouterr()
     assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
-    assert capsys.readouterr().out == f"the run in {out} has ended: 500 env steps\n"
+    line = f"the run in {out} has ended: 500 env steps"
+    assert capsys.readouterr().out == f"{line}\n" and ending.read(out) is None  # its rows are not there
+    # One that was killed, or told to end twice, while it drew pictures.
+    (out / "metrics.jsonl").write_text('{"kind": "eval", "env_steps": 500}\n')
+    for ended in (None, ending.Ending("stopped", 500)):
+        if ended is not None:
+            ending.write(out, ended)
+        assert train_in_process(*CATCH, f"--out={out}", "--resume=auto", "--dry_run") == 0
+        assert capsys.readouterr().out == f"{line}\n" and ending.read(out) == ended
+        assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
+        late = "; it was killed before ended.json said so, which it does now\n"
+        assert capsys.readouterr().out == line + late and ending.read(out) == ("finished", 500, "")
+        (out / "ended.json").unlink()
+    (out / "ended.json").write_text("{")
+    assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
+    assert ending.read(out) == ("finished", 500, "") and not (out / "lock").exists()
     assert len(loop.calls) == 1
+
+
+def test_a_run_that_has_ended_says_which_flags_come_too_late(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    train_in_process(*CATCH, f"--out={out}")
+    checkpoint_of(out, 500, ended=True)
+    line = resume.command_line(str(out))
+    capsys.readouterr()
+    assert train_in_process(*line, "--steps=500", "--nokeep_replay") == 0 and capsys.readouterr().err == ""
+    assert train_in_process(*line, "--logger=csv", "--nokeep_best") == 0
+    said = sorted(capsys.readouterr().err.splitlines())
+    late = ": changes nothing, the run has ended"
+    assert said == [f"resume: --keep_best{late}", f"resume: --logger{late}"]
+
+
+def test_the_help_of_resume_names_each_flag_that_may_follow():
+    flags = [INFOS[name].flag or name for name in (*MAY_CHANGE, *SOURCES)]
+    assert [flag for flag in flags if not re.search(rf"--{flag}\b", resume.__doc__)] == []
 
 
 def test_seeds_go_on_together(capsys, loop, tmp_path):

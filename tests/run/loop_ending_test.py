@@ -215,11 +215,14 @@ def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
         assert train(path, checkpoint_every=40, stop=stop).interrupted
     assert ending.read(path) == ("stopped", 60, "") and not ending.read(path).failed
     manifest, rows = whole(path), (path / "metrics.jsonl").read_bytes()
-    # What is refused changes nothing.
+    # What is refused changes nothing, not even what is better and of a later step.
     (path / "metrics.jsonl").write_bytes(b"")
+    later, begun = path / "best/000000120", []
+    later.mkdir(parents=True)
+    options = {"progress": False, "resume": manifest, "begun": lambda: begun.append(ending.read(path).status)}
     with pytest.raises(ConfigError, match="does not begin with the rows"):
-        loop.train(config, path, progress=False, resume=manifest)
-    assert ending.read(path).status == "stopped"
+        loop.train(config, path, **options)
+    assert ending.read(path).status == "stopped" and later.exists() and not begun
     (path / "metrics.jsonl").write_bytes(rows)
     # A run that is under way says nothing, and neither does one that is killed.
     update, seen = loop.Run.update, []
@@ -232,8 +235,9 @@ def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
 
     monkeypatch.setattr(loop.Run, "update", broken)
     with pytest.raises(RuntimeError):
-        loop.train(config, path, progress=False, resume=manifest)
+        loop.train(config, path, **options)
     assert ending.read(path) == ("failed", 100, "RuntimeError: two lines") and set(seen) == {None}
+    assert begun == ["stopped"] and not later.exists()
     monkeypatch.setattr(loop.Run, "update", update)
     loop.train(config, path, progress=False, resume=manifest)
     assert ending.read(path) == ("finished", 240, "")

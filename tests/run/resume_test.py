@@ -214,8 +214,7 @@ def test_a_best_policy_of_after_the_checkpoint_goes(stopped, tmp_path):
     (best,) = (run / "best").iterdir()
     shutil.copytree(best, run / "best" / f"{73:09d}")
     manifest = checkpoint.newest_good(run, pytest.fail)
-    resumed = make_run(config, run, resume=[manifest])
-    resumed.env_threads.shutdown()
+    go(config, run, 72, resume=[manifest])
     assert manifest.env_steps == 72
     assert [p.name for p in (run / "best").iterdir()] == [best.name]
 
