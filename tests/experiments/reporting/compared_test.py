@@ -6,6 +6,7 @@ import pytest
 
 from srl_jax.errors import ConfigError
 from srl_jax.run import ending
+from tests import helpers
 from tests.experiments.reporting.report_test import Page, build, write_run
 from tests.helpers import NOT_FINITE
 
@@ -93,3 +94,14 @@ def test_other_protocols_are_refused_or_said(tmp_path):
     shutil.rmtree(tmp_path / "b")
     with pytest.raises(ConfigError, match="gamma is 0.99 there and 0.5 here; --force"):
         build(tmp_path)
+
+
+def test_arms_that_are_evaluated_at_other_steps_keep_their_own_areas(tmp_path):
+    """Up to 300, a is a straight line to 3, and b has 0, 1, 1, 0: (0.5 + 1 + 0.5) / 3."""
+    helpers.write_run(tmp_path / "a/seed0", (0, 4), 400)
+    helpers.write_run(tmp_path / "b/seed0", (0, 1, 1, 0), 100, mode="joint")
+    page = Page(build(tmp_path, baseline="a"))
+    assert "Compared up to 300 env steps, where b, seed 0, ended." in page.text
+    table = page.table("Statistics of Catch")
+    assert table["a"][1] == "3.00 (no interval)" and table["a"][3] == "1.50 (no interval)"
+    assert table["b"][1] == "0.00 (no interval)" and table["b"][3] == "0.67 (no interval)"

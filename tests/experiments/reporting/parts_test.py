@@ -36,8 +36,8 @@ def test_whether_a_run_is_finished():
 
 def test_a_performance_profile_by_hand():
     # In Catch 0 is a miss, -1, and 1 a catch, 1: these end at 0.5 and 1, and at 0.
-    ends = {"rl": [[-1.0, 0.0], [-1.0, 1.0]], "joint": [[-1.0, -1.0]]}
-    comparison = numbers.Comparison(np.array([0, 100]), {arm: np.array(x) for arm, x in ends.items()}, None)
+    ends = {arm: {"at_the_end": np.array(x)} for arm, x in {"rl": [0.0, 1.0], "joint": [-1.0]}.items()}
+    comparison = numbers.Comparison(100, ends, {}, None)
     games, thresholds, found = numbers.profiles({"Catch": comparison})
     assert games == ["Catch"] and thresholds[0] < 0 and thresholds[-1] == 1.0
     rl, joint = found["rl"], found["joint"]
