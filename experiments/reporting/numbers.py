@@ -78,7 +78,7 @@ class Game(NamedTuple):
         """
         found = {}
         for arm, runs in collect.grouped(self.sound).get(self.name, {}).items():
-            rows = [row for run in runs for row in run.rows if row["kind"] == "final"]
+            rows = [row for run in runs for row in run.rows if row.get(collect.FINAL) is not None]
             if rows:
                 means = {self.name: np.array([row[collect.FINAL] for row in rows], float)}
                 games = " or ".join(map(str, sorted({row.get("final/games", "?") for row in rows})))

@@ -226,6 +226,8 @@ def _why_not(runs: Sequence[RunData], key: str) -> list[str]:
         why = ""
         if run.failed:
             why = run.ended.reason
+        elif count == 0 and any(key in row for row in run.rows):
+            why = f"{key} is null in each row"
         elif count == 0:
             why = "not evaluated yet" if key == RETURN else f"has no {key}"
         elif count == 1 and run.game in under_way:

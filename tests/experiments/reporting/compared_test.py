@@ -105,3 +105,15 @@ def test_arms_that_are_evaluated_at_other_steps_keep_their_own_areas(tmp_path):
     table = page.table("Statistics of Catch")
     assert table["a"][1] == "3.00 (no interval)" and table["a"][3] == "1.50 (no interval)"
     assert table["b"][1] == "0.00 (no interval)" and table["b"][3] == "0.67 (no interval)"
+
+
+def test_returns_that_are_null_are_left_out_and_said_to_be(tmp_path):
+    final = {"final_games": 2, "steps": 100}
+    for arm, returns in (("a", (0, 1)), ("b", (0, 1)), ("c", (None, None))):
+        helpers.write_run(tmp_path / f"Catch/{arm}/seed0", returns, final=(1, 3), lr_rl=1e-3, **final)
+    metrics = tmp_path / "Catch/b/seed0/metrics.jsonl"
+    metrics.write_text(metrics.read_text().replace('"final/return_mean": 2.0', '"final/return_mean": null'))
+    page = Page(build(tmp_path))
+    cells = {arm: row[-1] for arm, row in page.table("Statistics of Catch").items()}
+    assert cells["a"].startswith("2.00") and cells["b"] == "–" and "c" not in cells
+    assert "Not compared: c: 1 of 1 seed left out: eval/return_mean is null in each row (seed 0)" in page.text
