@@ -132,11 +132,11 @@ def reached_step(run: RunData) -> int:
 def finished(run: RunData) -> bool:
     """Whether its last rows are there: those of its last env steps, or of the return that ends a run.
 
-    Behind them is that of the final games, where it plays any. Not where it ended with an error all the same.
+    Behind them is that of the final games, where it plays any. What ended.json says counts, where there is one.
     """
     config = run.config
-    if run.failed:
-        return False
+    if run.ended is not None:
+        return run.ended.status == "finished"
     if config.final_games and has_policy(run):
         return run.rows[-1:] != [] and run.rows[-1]["kind"] == "final"
     steps, returns = collect.steps_and_returns(run)
