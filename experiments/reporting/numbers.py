@@ -90,10 +90,8 @@ class Game(NamedTuple):
     @property
     def left_out(self) -> list[str]:
         """A line for each arm of which seeds are not compared."""
-        whys: dict[str, dict[int, str]] = {arm: {} for arm in self.runs}
-        for run, why in collect.left_out([run for runs in self.runs.values() for run in runs]):
-            whys[run.arm][run.seed] = why
-        return [collect.left_out_text(arm, why, len(self.runs[arm])) for arm, why in whys.items() if why]
+        lines = collect.left_out_lines([run for runs in self.runs.values() for run in runs])
+        return [line.removeprefix(f"{self.name}, ") for line in lines]
 
 
 def arms_of(runs: Sequence[RunData]) -> list[str]:
@@ -132,7 +130,7 @@ def reached_step(run: RunData) -> int:
 def finished(run: RunData) -> bool:
     """Whether its last rows are there: those of its last env steps, or of the return that ends a run.
 
-    Behind them is that of the final games, where it plays any. What ended.json says counts, where there is one.
+    Behind them is that of the final games, where it plays any. Where there is an ended.json, it decides.
     """
     config = run.config
     if run.ended is not None:

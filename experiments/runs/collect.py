@@ -251,6 +251,17 @@ def left_out_text(arm: str, whys: Mapping[int, str], seeds: int) -> str:
     return f"{arm}: {len(whys)} of {seeds} seed{'' if seeds == 1 else 's'} left out: {reasons}"
 
 
+def left_out_lines(runs: Sequence[RunData]) -> list[str]:
+    """A line for each arm on a game of which seeds are `left_out`, see `left_out_text`."""
+    whys: dict[tuple[str, str], dict[int, str]] = {}
+    for run, why in left_out(runs):
+        whys.setdefault((run.game, run.arm), {})[run.seed] = why
+    groups = grouped(runs)
+    return [
+        f"{game}, {left_out_text(arm, those, len(groups[game][arm]))}" for (game, arm), those in whys.items()
+    ]
+
+
 def check_arms(runs: Sequence[RunData]) -> None:
     """Whether runs of one arm and game differ in nothing but their seed and where its encoder comes from.
 
