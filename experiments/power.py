@@ -119,7 +119,7 @@ def table(
         seeds: of each arm.
         power: how likely the smallest effect is found.
     """
-    head = [title, "runs", "SD", f"found in {power:.0%} with {seeds} seeds"]
+    head = [title, "runs", "SD", f"found in {100 * power:g}% with {seeds} seeds"]
     if effect is not None:
         head += [f"{effect:g} is found in", f"seeds for {effect:g}"]
     lines = [head]

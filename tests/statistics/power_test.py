@@ -117,6 +117,20 @@ def test_runs_are_compared_as_in_figures_and_what_is_left_out_is_said(tmp_path, 
         _lines(f"--from={tmp_path}", "--force")
 
 
+def test_spreads_may_be_as_large_and_small_as_numbers_are(capsys):
+    for unit in (1e300, 1e-300):
+        assert smallest_effect((unit, 2 * unit), (3, 4)) == pytest.approx(
+            unit * smallest_effect((1, 2), (3, 4))
+        )
+    assert welch_power(0.1, (1e300, 1e-300), (5, 5)) == pytest.approx(0.05, abs=0.02)
+    assert _lines("--spread=1e300", "--effect=0.1")[1][-3:] == ["4%", "over", f"{MOST:,}"]
+
+
+def test_the_head_has_the_power_that_was_asked_for():
+    heads = [" ".join(_lines("--spread=1", *more)[0]) for more in ([], ["--power=0.999"])]
+    assert heads == ["runs SD found in 80% with 5 seeds", "runs SD found in 99.9% with 5 seeds"]
+
+
 def test_published_spreads_are_those_of_the_tables():
     found = power.of_published("Boxing")
     der = next(x for x in found if x.name == "DER, 100 runs")
