@@ -19,6 +19,7 @@ from srl_jax.errors import ConfigError
 from tests.helpers import NOT_FINITE, write_run
 
 FIGURE = Figure("mine", "Mine", "?", (FigureArm("a", "catch/rl_only"), FigureArm("b", "catch/joint")))
+GONE = "Catch, {}: {} of {} seeds left out: not there (seed {})\n"
 
 
 @pytest.fixture
@@ -266,12 +267,24 @@ def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
     (runs / "Catch/a").rename(runs / "Catch/rl_only_nature")
     (runs / "Catch/b").rename(runs / "Catch/joint_256")
     assert _run("--figure=6.3", "--games=Catch", "--seeds=2", "--redraw", f"--out={runs}") == 0
-    assert capsys.readouterr().out == f"{runs / 'figures' / '6.3.png'}\n"
+    told = capsys.readouterr()
+    assert told.out == f"{runs / 'figures' / '6.3.png'}\n" and told.err == GONE.format(
+        "joint_50", 2, 2, "0, 1"
+    )
     catch = json.loads((runs / "figures" / "6.3.json").read_text())["games"]["Catch"]
     assert {arm: values["seeds"] for arm, values in catch["arms"].items()} == {
         "rl_only_nature": [0, 1],
         "joint_256": [0, 1],
     }
+
+    # Seeds that were asked for and are not there are said, and change nothing.
+    before = (runs / "figures" / "6.3.json").read_bytes()
+    (runs / "Catch/joint_256/seed2").rename(runs / "Catch/joint_256/seed5")
+    assert _run("--figure=6.3", "--games=Catch", "--seeds=0,1,3,4", "--redraw", f"--out={runs}") == 0
+    expected = [GONE.format(arm, 2, 4, "3, 4") for arm in catch["arms"]]
+    expected.append(GONE.format("joint_50", 4, 4, "0, 1, 3, 4"))
+    assert capsys.readouterr().err == "".join(expected)
+    assert (runs / "figures" / "6.3.json").read_bytes() == before
 
 
 def test_published_results_say_what_differs():
