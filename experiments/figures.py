@@ -327,7 +327,12 @@ def run(values: flags.FlagValues) -> int:
         asked = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
         for figure in figures:
             draws = write_scores if of_scores else write
-            print(draws(figure, read, games, root / "figures", **asked))
+            try:
+                print(draws(figure, read, games, root / "figures", **asked))
+            except ConfigError as error:
+                if not code:
+                    raise
+                display.say(str(error))  # of runs that failed, which the status says
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error
     return code

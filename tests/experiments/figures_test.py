@@ -287,6 +287,20 @@ def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
     assert (runs / "figures" / "6.3.json").read_bytes() == before
 
 
+def test_where_all_runs_failed_the_status_says_so(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(figures.launching, "run_sweep", lambda *_, **__: 1)
+    for made in ((), (0, 1)):
+        for seed in made:
+            write_run(tmp_path / f"Catch/rl_only_nature/seed{seed}", (0,), seed=seed, ended=NOT_FINITE)
+        assert _run("--figure=6.3", "--games=Catch", "--seeds=2", f"--out={tmp_path}") == 1
+        out, err = capsys.readouterr()
+        *gone, last = err.splitlines(keepends=True)
+        assert gone == [GONE.format(arm, 2, 2, "0, 1") for arm in ("joint_256", "joint_50") if made]
+        assert out == "" and last.startswith(f"no evaluation of any arm of figure 6.3 in {tmp_path}")
+        assert not (tmp_path / "figures").exists()
+
+
 def test_published_results_say_what_differs():
     config = Config(game="Pong", steps=300_000)
     human, rainbow = figures.published_levels("Pong", ["Human", "Dopamine Rainbow"], config, 260_000)
