@@ -31,6 +31,9 @@ FLAGS = flags.FLAGS
 LONGEST = 40
 """Characters of a label that says what differs; where it would be longer, it is the arm's name."""
 
+ABSENT = "-"
+"""Of an option of a row, in an arm that has not the row."""
+
 
 class Arm(NamedTuple):
     """One arm on one game below one of the arguments.
@@ -105,7 +108,10 @@ def _labels(arms: Sequence[Arm]) -> list[str]:
     """The settings that tell arms of a game apart, the first ones that do; names where these are too long."""
     labels = [""] * len(arms)
     for flag, values in differing(arms).items():
-        longer = [f"{old}, {flag}={x}".removeprefix(", ") for old, x in zip(labels, values, strict=True)]
+        longer = [
+            old if x == ABSENT else f"{old}, {flag}={x}".removeprefix(", ")
+            for old, x in zip(labels, values, strict=True)
+        ]
         if len(set(longer)) > len(set(labels)):
             labels = longer
     if not all(0 < len(label) <= LONGEST for label in labels):
@@ -117,15 +123,15 @@ def _labels(arms: Sequence[Arm]) -> list[str]:
 
 
 def differing(arms: Sequence[Arm]) -> dict[str, list[str]]:
-    """The settings that arms all have and in which they differ: {flag: its value in each}.
+    """The settings in which two arms that have them differ: {flag: its value in each arm, or `ABSENT`}.
 
     An option of a specification is a setting, too: rainbow:n_step. Games, and what seeds of an arm may differ
     in, do not count.
     """
     each = [_settings(arm.config) for arm in arms]
-    shared = [name for name in each[0] if all(name in settings for settings in each)]
-    found = {name: [settings[name] for settings in each] for name in shared}
-    return {name: values for name, values in found.items() if len(set(values)) > 1}
+    names = dict.fromkeys(name for settings in each for name in settings)
+    found = {name: [settings.get(name, ABSENT) for settings in each] for name in names}
+    return {name: values for name, values in found.items() if len({*values} - {ABSENT}) > 1}
 
 
 def _settings(config: Config) -> dict[str, str]:

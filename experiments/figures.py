@@ -322,13 +322,36 @@ def run(values: flags.FlagValues) -> int:
             if code >= 128:  # told to end
                 return code
         read = collect.load_named(root, [run.name for run in runs])
+        for line in absent(figures, games, seeds, read):
+            display.say(line)
         asked = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}
         for figure in figures:
             draws = write_scores if of_scores else write
-            print(draws(figure, read, games, root / "figures", **asked))
+            try:
+                print(draws(figure, read, games, root / "figures", **asked))
+            except ConfigError as error:
+                if not code:
+                    raise
+                display.say(str(error))  # of runs that failed, which the status says
     except OSError as error:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error
     return code
+
+
+def absent(
+    figures: Sequence[Figure], games: Sequence[str], seeds: Sequence[int], runs: Sequence[RunData]
+) -> list[str]:
+    """A line for each arm on a game of which seeds that were asked for have no run; none where there is none.
+
+    They are not in a figure's numbers: a campaign may have fewer seeds of an arm.
+    """
+    there = {run.key for run in runs}
+    lines = []
+    for game in games if there else ():
+        for arm in dict.fromkeys(arm.name for figure in figures for arm in figure.arms):
+            if gone := {seed: "not there" for seed in seeds if (game, arm, seed) not in there}:
+                lines.append(f"{game}, {collect.left_out_text(arm, gone, len(seeds))}")
+    return lines
 
 
 def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directory: Path, **how: Any) -> Path:

@@ -48,23 +48,34 @@ class Spread(NamedTuple):
     deviation: float
 
 
-def of_runs(root: Path, only: str | None = None) -> dict[str, list[Spread]]:
+def of_runs(root: Path, only: str | None = None, *, force: bool = False) -> dict[str, list[Spread]]:
     """The spread of each arm's area under the learning curve, and of all arms of a game together.
+
+    Says which runs, and which arms, are left out.
 
     Args:
         root: run directories, or packed runs.
         only: the game that counts; None for all.
+        force: take runs of different protocols together, and say what differs.
 
     Raises:
-        ConfigError: there are no runs, or no arm has enough of them.
+        ConfigError: there are no runs, no arm has enough of them, or they are unlike.
     """
-    runs = [run for run in collect.load_runs(root) if collect.has_policy(run)]
+    runs = [run for run in collect.load_runs(root) if collect.has_policy(run) and only in (None, run.game)]
+    collect.check_arms(runs)
+    for line in collect.check_protocols(runs, force=force) + collect.left_out_lines(runs):
+        display.say(line)
     found: dict[str, list[Spread]] = {}
     for game, arms in collect.grouped(collect.comparable(runs)).items():
         curves = {arm: [collect.steps_and_returns(run) for run in its] for arm, its in arms.items()}
         areas = {arm: its["area_under_curve"] for arm, its in collect.ends(curves)[1].items()}
+        for arm, x in areas.items():
+            if len(x) < FEWEST:
+                display.say(
+                    f"{game}, {arm}: left out: {len(x)} run{'s'[: len(x) > 1]}, a spread takes {FEWEST}"
+                )
         spreads = [Spread(arm, len(x), float(x.std(ddof=1))) for arm, x in areas.items() if len(x) >= FEWEST]
-        if spreads and only in (None, game):
+        if spreads:
             found[game] = [*spreads, pooled(spreads)]
     if not found:
         raise ConfigError(f"--from={root}: no arm{f' of {only}' if only else ''} has {FEWEST} runs")
@@ -108,7 +119,7 @@ def table(
         seeds: of each arm.
         power: how likely the smallest effect is found.
     """
-    head = [title, "runs", "SD", f"found in {power:.0%} with {seeds} seeds"]
+    head = [title, "runs", "SD", f"found in {100 * power:g}% with {seeds} seeds"]
     if effect is not None:
         head += [f"{effect:g} is found in", f"seeds for {effect:g}"]
     lines = [head]
@@ -155,6 +166,12 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
         "of --from, given twice: the two that differ; by default each beside one like it",
         flag_values=values,
     )
+    flags.DEFINE_boolean(
+        "force",
+        False,
+        "of --from: take runs of different protocols of evaluation together",
+        flag_values=values,
+    )
 
 
 def report(values: flags.FlagValues) -> list[str]:
@@ -176,7 +193,7 @@ def report(values: flags.FlagValues) -> list[str]:
         raise ConfigError(f"--arm={arms[0]}: give it twice, for the two arms, or not at all")
     game = envs.canonical(values["game"].value) if values["game"].value else None
     if source != PUBLISHED:
-        found = of_runs(Path(os.path.expanduser(source)), game)
+        found = of_runs(Path(os.path.expanduser(source)), game, force=values["force"].value)
     elif game and (spreads := of_published(game)):
         found = {game: spreads}
     else:

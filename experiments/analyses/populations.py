@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from srl_jax import data, statistics
+from srl_jax import data
 from srl_jax.errors import ConfigError
 from srl_jax.files.reading import ROWS, read_json
 
@@ -72,17 +72,19 @@ def chosen(results: Path = RESULTS) -> list[ChosenArm]:
     return found
 
 
-def areas(arm: ChosenArm, start: int = 0, until: int | None = None) -> np.ndarray:
+def areas(arm: ChosenArm, start: int = 0, until: float = np.inf) -> np.ndarray:
     """The area under each run's learning curve, float64 [runs], between evaluations that all of them have.
 
     Args:
         arm: whose runs.
         start: env step of the first evaluation, or before it.
-        until: env step of the last one, or after it; None for the end.
+        until: env step of the last one, or after it.
     """
-    steps, returns = statistics.at_equal_steps([collect.steps_and_returns(run) for run in arm.runs])
-    kept = (steps >= start) & (steps <= (steps[-1] if until is None else until))
-    return statistics.area_under_curve(steps[kept], returns[:, kept])
+    curves = []
+    for steps, returns in map(collect.steps_and_returns, arm.runs):
+        kept = (steps >= start) & (steps <= until)
+        curves.append((steps[kept], returns[kept]))
+    return collect.ends({arm.name: curves})[1][arm.name]["area_under_curve"]
 
 
 def residuals(groups: Sequence[np.ndarray]) -> np.ndarray:

@@ -94,11 +94,10 @@ def learning_curves(
     game: str, comparison: numbers.Comparison, looks: Looks, baseline: str | None
 ) -> dict[str, list[Shown]]:
     """ "means": all arms, the baseline and a few in each picture; "seeds": each arm with all of its seeds."""
-    none = np.full(len(comparison.steps), np.nan)
     means, seeds = {}, {}
-    for arm, returns in comparison.returns.items():
-        means[arm] = Curve(comparison.steps, *statistics.curve_interval(returns)[:3])
-        seeds[arm] = [Curve(comparison.steps, one, none, none) for one in returns]
+    for arm, its in comparison.curves.items():
+        means[arm] = pictures.interval_curves(its)
+        seeds[arm] = [pictures.interval_curves([one]) for one in its]
     policies = {name: row.return_mean for name, row in reference_policies(game).items()}
     every = [*means.values(), *(curve for curves in seeds.values() for curve in curves)]
     how = {"policies": policies, "limits": pictures.heights(every, policies.values())}
@@ -109,6 +108,7 @@ def learning_curves(
     for arm, curves in seeds.items():
         colour, line = looks[arm]
         lines = [((colour + FAINT, "-"), curve) for curve in curves]
+        none = np.full(len(means[arm].at), np.nan)
         lines.append(((colour, line), means[arm]._replace(low=none, high=none)))
         picture = pictures.curves(arm, lines, size=(3.0, 2.1), **how)
         apart.append(Shown(picture, f"{game}: {arm}, each seed"))
@@ -123,7 +123,7 @@ def profiles(
     if all(np.isnan(interval.low).all() for interval in found.values()):
         return []
     curves = {arm: Curve(thresholds, *interval[:3]) for arm, interval in found.items()}
-    counts = {arm: sum(len(comparisons[game].returns[arm]) for game in games) for arm in found}
+    counts = {arm: sum(len(comparisons[game].ends[arm]["at_the_end"]) for game in games) for arm in found}
     across = "normalised return at the end"
     if any(interval.kind == statistics.NARROW for interval in found.values()):
         across += f"\nbands of fewer than {statistics.ENOUGH} runs are too narrow"

@@ -25,16 +25,18 @@ THRESHOLDS = 101
 
 
 class Comparison(NamedTuple):
-    """The learning curves of one game at steps that all of them have.
+    """The learning curves of one game between the env steps that all of them have.
 
     Attributes:
-        steps: int64 [points].
-        returns: arm -> float64 [runs, points].
+        until: the last of these env steps.
+        ends: arm -> what arms are compared by, see `collect.ends`.
+        curves: arm -> of its runs, see `collect.shared`.
         cut_by: the run that ends first, where others continue.
     """
 
-    steps: np.ndarray
-    returns: dict[str, np.ndarray]
+    until: int
+    ends: dict[str, dict[str, np.ndarray]]
+    curves: dict[str, collect.Curves]
     cut_by: RunData | None
 
 
@@ -76,7 +78,7 @@ class Game(NamedTuple):
         """
         found = {}
         for arm, runs in collect.grouped(self.sound).get(self.name, {}).items():
-            rows = [row for run in runs for row in run.rows if row["kind"] == "final"]
+            rows = [row for run in runs for row in run.rows if row.get(collect.FINAL) is not None]
             if rows:
                 means = {self.name: np.array([row[collect.FINAL] for row in rows], float)}
                 games = " or ".join(map(str, sorted({row.get("final/games", "?") for row in rows})))
@@ -88,10 +90,8 @@ class Game(NamedTuple):
     @property
     def left_out(self) -> list[str]:
         """A line for each arm of which seeds are not compared."""
-        whys: dict[str, dict[int, str]] = {arm: {} for arm in self.runs}
-        for run, why in collect.left_out([run for runs in self.runs.values() for run in runs]):
-            whys[run.arm][run.seed] = why
-        return [collect.left_out_text(arm, why, len(self.runs[arm])) for arm, why in whys.items() if why]
+        lines = collect.left_out_lines([run for runs in self.runs.values() for run in runs])
+        return [line.removeprefix(f"{self.name}, ") for line in lines]
 
 
 def arms_of(runs: Sequence[RunData]) -> list[str]:
@@ -130,11 +130,11 @@ def reached_step(run: RunData) -> int:
 def finished(run: RunData) -> bool:
     """Whether its last rows are there: those of its last env steps, or of the return that ends a run.
 
-    Behind them is that of the final games, where it plays any. Not where it ended with an error all the same.
+    Behind them is that of the final games, where it plays any. Where there is an ended.json, it decides.
     """
     config = run.config
-    if run.failed:
-        return False
+    if run.ended is not None:
+        return run.ended.status == "finished"
     if config.final_games and has_policy(run):
         return run.rows[-1:] != [] and run.rows[-1]["kind"] == "final"
     steps, returns = collect.steps_and_returns(run)
@@ -146,32 +146,31 @@ def finished(run: RunData) -> bool:
 
 
 def compare(runs: Sequence[RunData]) -> Comparison | None:
-    """The learning curves of one game's runs at equal steps; None where there is no step that all have.
+    """The learning curves of one game's runs, as figures compare them; None where no env step is all's.
 
     Raises:
         ConfigError: the evaluations of a run are not in ascending order.
     """
-    curves = [collect.steps_and_returns(run) for run in runs]
-    for run, (steps, _) in zip(runs, curves, strict=True):
-        if (np.diff(steps) <= 0).any():
-            raise ConfigError(f"{run.path}: evaluations in metrics.jsonl are not in ascending order")
+    every = [collect.steps_and_returns(run) for run in runs]
+    curves: dict[str, list] = {}
+    for run, curve in zip(runs, every, strict=True):
+        curves.setdefault(run.arm, []).append(curve)
     try:
-        steps, returns = statistics.at_equal_steps(curves)
-    except ValueError:
+        shared = collect.shared(curves)
+    except ConfigError:
         return None
-    ends = [int(curve[0][-1]) for curve in curves]
-    first = runs[int(np.argmin(ends))] if min(ends) < max(ends) else None
-    arms = dict.fromkeys(run.arm for run in runs)
-    return Comparison(steps, {arm: returns[[run.arm == arm for run in runs]] for arm in arms}, first)
+    until, ends = collect.ends(shared)
+    last = [int(steps[-1]) for steps, _ in every]
+    first = runs[last.index(until)] if until < max(last) else None
+    return Comparison(until, ends, shared, first)
 
 
 def scores(comparisons: Mapping[str, Comparison], of: str) -> dict[str, dict[str, np.ndarray]]:
-    """arm -> game -> float64 [runs]: the last return, "final", or the one averaged over env steps, "area"."""
+    """arm -> game -> float64 [runs]: "at_the_end" or "area_under_curve", see `collect.ends`."""
     found: dict[str, dict[str, np.ndarray]] = {}
     for game, comparison in comparisons.items():
-        for arm, curves in comparison.returns.items():
-            area = statistics.area_under_curve(comparison.steps, curves)
-            found.setdefault(arm, {})[game] = area if of == "area" else curves[:, -1]
+        for arm, ends in comparison.ends.items():
+            found.setdefault(arm, {})[game] = ends[of]
     return found
 
 
@@ -209,8 +208,8 @@ def reaching(comparison: Comparison, target: float) -> dict[str, tuple[Interval,
     NEVER or more is never.
     """
     found = {}
-    for arm, curves in comparison.returns.items():
-        taken = statistics.steps_to(comparison.steps, curves, target)
+    for arm, curves in comparison.curves.items():
+        taken = np.array([statistics.steps_to(*curve, target) for curve in curves])
         times = {"": np.where(np.isnan(taken), NEVER, taken)}
         median = statistics.estimate(lambda drawn: np.median(drawn[""], axis=-1), times)
         found[arm] = median, int(np.isfinite(taken).sum())
@@ -224,7 +223,7 @@ def profiles(comparisons: Mapping[str, Comparison]) -> tuple[list[str], np.ndarr
         The games that every arm with a policy has and that have reference scores; thresholds [T], from just
         below the smallest score to the largest; arm -> its profile [T], no arm where there is no such game.
     """
-    given = scores(comparisons, "final")
+    given = scores(comparisons, "at_the_end")
     games = with_reference_scores(game for game in comparisons if all(game in x for x in given.values()))
     if not games:
         return [], np.zeros(0), {}

@@ -132,11 +132,13 @@ def steps_and_values(run: RunData, key: str) -> tuple[np.ndarray, np.ndarray]:
     """Env steps int64 [N], ascending, and a key's values float64 [N], of rows where it is not null.
 
     Raises:
-        ConfigError: a value is no number.
+        ConfigError: a value is no number, or rows are not in ascending order.
     """
     found = {row["env_steps"]: row[key] for row in run.rows if row.get(key) is not None}
     if not all(isinstance(value, int | float) for value in found.values()):
         raise ConfigError(f"{run.path}: {key} is not a number in each row")
+    if sorted(found) != list(found):
+        raise ConfigError(f"{run.path}: the env steps of {key} in metrics.jsonl are not in ascending order")
     return np.array(list(found), np.int64), np.array(list(found.values()), np.float64)
 
 
@@ -147,6 +149,28 @@ def steps_and_returns(run: RunData) -> tuple[np.ndarray, np.ndarray]:
 
 Curves = Sequence[tuple[np.ndarray, np.ndarray]]
 """Of an arm's runs, as of `steps_and_returns`."""
+
+
+def shared(arms: Mapping[Any, Curves]) -> dict[Any, Curves]:
+    """The curves of a game's arms between the env steps that all of them have, whose ends all have then.
+
+    What a run's curve has at an end is interpolated; no other run's evaluations change what lies between.
+
+    Raises:
+        ConfigError: there is no such step.
+    """
+    every = [steps for curves in arms.values() for steps, _ in curves]
+    start, until = max(int(steps[0]) for steps in every), min(int(steps[-1]) for steps in every)
+    if start > until:
+        raise ConfigError(
+            f"--runs: no env step that all curves have: one begins at {start:,}, another ends at {until:,}"
+        )
+
+    def cut(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        at = np.unique([start, *steps[(steps > start) & (steps < until)], until])
+        return at, np.interp(at, steps, values)
+
+    return {arm: [cut(*curve) for curve in curves] for arm, curves in arms.items()}
 
 
 def ends(arms: Mapping[Any, Curves]) -> tuple[int, dict[Any, dict[str, np.ndarray]]]:
@@ -162,24 +186,15 @@ def ends(arms: Mapping[Any, Curves]) -> tuple[int, dict[Any, dict[str, np.ndarra
     Raises:
         ConfigError: there is no such step.
     """
-    every = [steps for curves in arms.values() for steps, _ in curves]
-    start, until = max(int(steps[0]) for steps in every), min(int(steps[-1]) for steps in every)
-    if start > until:
-        raise ConfigError(
-            f"--runs: no env step that all curves have: one begins at {start:,}, another ends at {until:,}"
-        )
-    found = {}
-    for arm, curves in arms.items():
-        grid, returns = statistics.at_equal_steps(curves)
-        if start > grid[0]:
-            later = grid > start
-            first = [[np.interp(start, grid, one)] for one in returns]
-            grid, returns = np.append(start, grid[later]), np.hstack([first, returns[:, later]])
-        found[arm] = {
-            "area_under_curve": statistics.area_under_curve(grid, returns, until),
-            "at_the_end": np.array([np.interp(until, grid, one) for one in returns]),
+    cut = shared(arms)
+    until = next(int(steps[-1]) for curves in cut.values() for steps, _ in curves)
+    return until, {
+        arm: {
+            "area_under_curve": np.array([statistics.area_under_curve(*curve) for curve in curves]),
+            "at_the_end": np.array([values[-1] for _, values in curves]),
         }
-    return until, found
+        for arm, curves in cut.items()
+    }
 
 
 def has_policy(run: RunData) -> bool:
@@ -211,6 +226,8 @@ def _why_not(runs: Sequence[RunData], key: str) -> list[str]:
         why = ""
         if run.failed:
             why = run.ended.reason
+        elif count == 0 and any(key in row for row in run.rows):
+            why = f"{key} is null in each row"
         elif count == 0:
             why = "not evaluated yet" if key == RETURN else f"has no {key}"
         elif count == 1 and run.game in under_way:
@@ -232,6 +249,17 @@ def left_out_text(arm: str, whys: Mapping[int, str], seeds: int) -> str:
         of.setdefault(why, []).append(str(seed))
     reasons = "; ".join(f"{why} (seed {', '.join(those)})" for why, those in of.items())
     return f"{arm}: {len(whys)} of {seeds} seed{'' if seeds == 1 else 's'} left out: {reasons}"
+
+
+def left_out_lines(runs: Sequence[RunData]) -> list[str]:
+    """A line for each arm on a game of which seeds are `left_out`, see `left_out_text`."""
+    whys: dict[tuple[str, str], dict[int, str]] = {}
+    for run, why in left_out(runs):
+        whys.setdefault((run.game, run.arm), {})[run.seed] = why
+    groups = grouped(runs)
+    return [
+        f"{game}, {left_out_text(arm, those, len(groups[game][arm]))}" for (game, arm), those in whys.items()
+    ]
 
 
 def check_arms(runs: Sequence[RunData]) -> None:

@@ -32,8 +32,8 @@ def at_equal_steps(curves: Sequence[tuple[Any, Any]]) -> tuple[np.ndarray, np.nd
 
     Returns:
         env steps, int64 [points], from the latest beginning to the earliest end: where evaluations differ,
-        those of the curve that has the fewest there; returns, float64 [runs, points], linearly interpolated
-        in between.
+        those of the curve that has the fewest, at least one; returns, float64 [runs, points], linearly
+        interpolated in between.
 
     Raises:
         ValueError: no curves, one that is not ascending or not finite, or no step that all have.
@@ -43,8 +43,8 @@ def at_equal_steps(curves: Sequence[tuple[Any, Any]]) -> tuple[np.ndarray, np.nd
     checked = [_curve(steps, returns) for steps, returns in curves]
     start, end = max(s[0] for s, _ in checked), min(s[-1] for s, _ in checked)
     within = [steps[(steps >= start) & (steps <= end)] for steps, _ in checked]
-    grid = min(within, key=len)
-    if not len(grid):
+    grid = min(filter(len, within), key=len, default=None)
+    if grid is None:
         raise ValueError(f"no evaluation at a step that all {len(checked)} curves have")
     return grid, np.stack([np.interp(grid, steps, returns) for steps, returns in checked])
 

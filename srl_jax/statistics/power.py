@@ -113,7 +113,8 @@ def _integral(
     if len(runs) != 2 or not all(n >= 2 for n in runs):
         raise ValueError(f"runs={tuple(runs)}: must be two numbers of runs, at least 2 each")
     m, n = (int(count) - 1 for count in runs)
-    mine, theirs = (spread**2 / count for spread, count in zip(spreads, runs, strict=True))
+    largest = max(spreads)  # the unit, so that no square is out of range
+    mine, theirs = ((spread / largest) ** 2 / count for spread, count in zip(spreads, runs, strict=True))
     # The variances over their expectations are r^2 sin^2 / m and r^2 cos^2 / n of an angle and a radius.
     width = 8 / math.sqrt(m + n)
     angle, of_angle = _nodes(64, math.atan(math.sqrt(m / n)), width, math.pi / 2)
@@ -128,7 +129,7 @@ def _integral(
     freedom = 1 / (share**2 / m + (1 - share) ** 2 / n)
     bounds = (t_quantile(level, freedom) * np.sqrt((v + w) / (mine + theirs)))[:, None] * radius
     weights = of_angle[:, None] * of_radius
-    return math.sqrt(mine + theirs), bounds, weights / weights.sum()
+    return largest * math.sqrt(mine + theirs), bounds, weights / weights.sum()
 
 
 def _nodes(count: int, middle: float, width: float, most: float) -> tuple[np.ndarray, np.ndarray]:

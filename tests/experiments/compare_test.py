@@ -106,10 +106,17 @@ def test_labels_are_the_first_settings_that_tell_arms_apart():
     joint = {"mode": "joint", "objectives": ("reconstruction:weight=1",)}
     light = {"mode": "joint", "objectives": ("reconstruction:weight=0.1", "latent_l2:weight=1")}
     arms = _arms(Config(), Config(**joint), Config(**light))
-    assert compare.differing(arms).keys() == {"mode", "objective"}
+    weights = ["-", "1", "0.1"]  # the first one has no decoder
+    assert compare.differing(arms).pop("reconstruction:weight") == weights
+    assert compare.differing(arms).keys() == {"mode", "objective", "reconstruction:weight"}
     assert compare._labels(arms) == ["arm0", "arm1", "arm2"]  # the objectives are too long
     arms = _arms(*(Config(mode="joint", objectives=(f"reconstruction:weight={x}",)) for x in (1, 2)))
     assert compare._labels(arms) == ["reconstruction:weight=1", "reconstruction:weight=2"]
+    assert compare._labels([*arms, *_arms(Config())]) == [
+        "mode=joint, reconstruction:weight=1",
+        "mode=joint, reconstruction:weight=2",
+        "mode=rl_only",
+    ]
     assert compare._labels(_arms(Config(), Config(seed=1))) == ["arm0", "arm1"]
     same = [arm._replace(name="x") for arm in _arms(Config(), Config())]
     assert compare._labels(same) == ["runs/arm0", "runs/arm1"]

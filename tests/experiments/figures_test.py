@@ -19,6 +19,7 @@ from srl_jax.errors import ConfigError
 from tests.helpers import NOT_FINITE, write_run
 
 FIGURE = Figure("mine", "Mine", "?", (FigureArm("a", "catch/rl_only"), FigureArm("b", "catch/joint")))
+GONE = "Catch, {}: {} of {} seeds left out: not there (seed {})\n"
 
 
 @pytest.fixture
@@ -152,15 +153,17 @@ def test_the_report_has_the_same_numbers(tmp_path):
     returns = np.random.default_rng(0).normal(size=(10, 3))
     for i, arm in enumerate("ab"):
         for seed in range(5):
-            mode = "joint" if arm == "b" else "rl_only"
-            write_run(tmp_path / f"Catch/{arm}/seed{seed}", returns[5 * i + seed], seed=seed, mode=mode)
+            own = (
+                {"mode": "joint", "every": 150} if arm == "b" else {"every": 100}
+            )  # b is evaluated less often
+            write_run(tmp_path / f"Catch/{arm}/seed{seed}", returns[5 * i + seed], seed=seed, **own)
     mine = _evaluated(tmp_path)["games"]["Catch"]["arms"]
     comparisons = {"Catch": compare(collect.load_runs(tmp_path))}
-    for here, there in (("at_the_end", "final"), ("area_under_curve", "area")):
-        found = table(comparisons, there, "a")["Catch"]
-        assert tuple(mine["a"][here].values())[:4] == found["a"]["return"]
-        assert tuple(mine["b"][here].values())[:4] == found["b"]["return"]
-        difference = mine["b"]["against_baseline"][here]
+    for of in ("at_the_end", "area_under_curve"):
+        found = table(comparisons, of, "a")["Catch"]
+        assert tuple(mine["a"][of].values())[:4] == found["a"]["return"]
+        assert tuple(mine["b"][of].values())[:4] == found["b"]["return"]
+        difference = mine["b"]["against_baseline"][of]
         assert tuple(difference.values())[:4] == found["b"]["return_difference"]
 
 
@@ -264,12 +267,38 @@ def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
     (runs / "Catch/a").rename(runs / "Catch/rl_only_nature")
     (runs / "Catch/b").rename(runs / "Catch/joint_256")
     assert _run("--figure=6.3", "--games=Catch", "--seeds=2", "--redraw", f"--out={runs}") == 0
-    assert capsys.readouterr().out == f"{runs / 'figures' / '6.3.png'}\n"
+    told = capsys.readouterr()
+    assert told.out == f"{runs / 'figures' / '6.3.png'}\n" and told.err == GONE.format(
+        "joint_50", 2, 2, "0, 1"
+    )
     catch = json.loads((runs / "figures" / "6.3.json").read_text())["games"]["Catch"]
     assert {arm: values["seeds"] for arm, values in catch["arms"].items()} == {
         "rl_only_nature": [0, 1],
         "joint_256": [0, 1],
     }
+
+    # Seeds that were asked for and are not there are said, and change nothing.
+    before = (runs / "figures" / "6.3.json").read_bytes()
+    (runs / "Catch/joint_256/seed2").rename(runs / "Catch/joint_256/seed5")
+    assert _run("--figure=6.3", "--games=Catch", "--seeds=0,1,3,4", "--redraw", f"--out={runs}") == 0
+    expected = [GONE.format(arm, 2, 4, "3, 4") for arm in catch["arms"]]
+    expected.append(GONE.format("joint_50", 4, 4, "0, 1, 3, 4"))
+    assert capsys.readouterr().err == "".join(expected)
+    assert (runs / "figures" / "6.3.json").read_bytes() == before
+
+
+def test_where_all_runs_failed_the_status_says_so(tmp_path, monkeypatch, capsys):
+    pytest.importorskip("matplotlib")
+    monkeypatch.setattr(figures.launching, "run_sweep", lambda *_, **__: 1)
+    for made in ((), (0, 1)):
+        for seed in made:
+            write_run(tmp_path / f"Catch/rl_only_nature/seed{seed}", (0,), seed=seed, ended=NOT_FINITE)
+        assert _run("--figure=6.3", "--games=Catch", "--seeds=2", f"--out={tmp_path}") == 1
+        out, err = capsys.readouterr()
+        *gone, last = err.splitlines(keepends=True)
+        assert gone == [GONE.format(arm, 2, 2, "0, 1") for arm in ("joint_256", "joint_50") if made]
+        assert out == "" and last.startswith(f"no evaluation of any arm of figure 6.3 in {tmp_path}")
+        assert not (tmp_path / "figures").exists()
 
 
 def test_published_results_say_what_differs():

@@ -10,7 +10,7 @@ from experiments.command_line import flags as config_flags
 from srl_jax import data
 from srl_jax.errors import ConfigError
 from srl_jax.statistics import MOST, runs_needed, smallest_effect, welch_p, welch_power
-from tests.helpers import write_run
+from tests.helpers import NOT_FINITE, write_run
 
 
 def _lines(*arguments):
@@ -91,6 +91,44 @@ def test_the_spread_of_runs_is_that_of_their_area(tmp_path):
     (_, row) = _lines(f"--from={tmp_path}", "--effect=2", "--arm=b", "--arm=a", "--game=Catch")
     assert row[:7] == ["b", "and", "a", "3", "3", "and", "1"]
     assert row[-1] == str(runs_needed(2, (3, 1)))
+
+
+def test_runs_are_compared_as_in_figures_and_what_is_left_out_is_said(tmp_path, capsys):
+    for seed in range(3):
+        write_run(tmp_path / f"Catch/a/seed{seed}", (seed, seed), seed=seed)
+    before = _lines(f"--from={tmp_path}")
+    assert capsys.readouterr().err == ""
+    write_run(tmp_path / "Catch/a/seed3", (9, 9), seed=3, ended=NOT_FINITE)
+    write_run(tmp_path / "Catch/few/seed0", (0, 0))
+    assert _lines(f"--from={tmp_path}") == before
+    assert capsys.readouterr().err.splitlines() == [
+        f"Catch, a: 1 of 4 seeds left out: {NOT_FINITE.reason} (seed 3)",
+        "Catch, few: left out: 1 run, a spread takes 3",
+    ]
+    write_run(tmp_path / "Catch/noisy/seed0", (0, 0), eps_eval=0.5)
+    with pytest.raises(
+        ConfigError, match="another protocol than .*eps_eval is 0.005 there and 0.5 here; --f"
+    ):
+        _lines(f"--from={tmp_path}")
+    assert _lines(f"--from={tmp_path}", "--force") == before
+    assert "another protocol" in capsys.readouterr().err
+    write_run(tmp_path / "Catch/a/seed4", (0, 0), seed=4, gamma=0.5)
+    with pytest.raises(ConfigError, match="of the same arm, a on Catch, .*gamma is 0.99 there and 0.5 here"):
+        _lines(f"--from={tmp_path}", "--force")
+
+
+def test_spreads_may_be_as_large_and_small_as_numbers_are(capsys):
+    for unit in (1e300, 1e-300):
+        assert smallest_effect((unit, 2 * unit), (3, 4)) == pytest.approx(
+            unit * smallest_effect((1, 2), (3, 4))
+        )
+    assert welch_power(0.1, (1e300, 1e-300), (5, 5)) == pytest.approx(0.05, abs=0.02)
+    assert _lines("--spread=1e300", "--effect=0.1")[1][-3:] == ["4%", "over", f"{MOST:,}"]
+
+
+def test_the_head_has_the_power_that_was_asked_for():
+    heads = [" ".join(_lines("--spread=1", *more)[0]) for more in ([], ["--power=0.999"])]
+    assert heads == ["runs SD found in 80% with 5 seeds", "runs SD found in 99.9% with 5 seeds"]
 
 
 def test_published_spreads_are_those_of_the_tables():

@@ -435,6 +435,9 @@ def test_curves_meet_where_all_of_them_are():
     assert steps.tolist() == [20, 40] and returns.tolist() == [[3, 5], [8, 0]]
     steps, returns = at_equal_steps([([0, 10], [1, 3]), ([0], [2])])
     assert steps.tolist() == [0] and returns.tolist() == [[1], [2]]
+    # One that has no evaluation where both are does not decide.
+    steps, returns = at_equal_steps([([0, 10], [1, 3]), ([4, 5], [2, 2])])
+    assert steps.tolist() == [4, 5] and returns.tolist() == [pytest.approx([1.8, 2]), [2, 2]]
 
 
 def test_area_under_a_curve_is_its_mean_over_time():

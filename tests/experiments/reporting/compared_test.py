@@ -6,6 +6,7 @@ import pytest
 
 from srl_jax.errors import ConfigError
 from srl_jax.run import ending
+from tests import helpers
 from tests.experiments.reporting.report_test import Page, build, write_run
 from tests.helpers import NOT_FINITE
 
@@ -93,3 +94,26 @@ def test_other_protocols_are_refused_or_said(tmp_path):
     shutil.rmtree(tmp_path / "b")
     with pytest.raises(ConfigError, match="gamma is 0.99 there and 0.5 here; --force"):
         build(tmp_path)
+
+
+def test_arms_that_are_evaluated_at_other_steps_keep_their_own_areas(tmp_path):
+    """Up to 300, a is a straight line to 3, and b has 0, 1, 1, 0: (0.5 + 1 + 0.5) / 3."""
+    helpers.write_run(tmp_path / "a/seed0", (0, 4), 400)
+    helpers.write_run(tmp_path / "b/seed0", (0, 1, 1, 0), 100, mode="joint")
+    page = Page(build(tmp_path, baseline="a"))
+    assert "Compared up to 300 env steps, where b, seed 0, ended." in page.text
+    table = page.table("Statistics of Catch")
+    assert table["a"][1] == "3.00 (no interval)" and table["a"][3] == "1.50 (no interval)"
+    assert table["b"][1] == "0.00 (no interval)" and table["b"][3] == "0.67 (no interval)"
+
+
+def test_returns_that_are_null_are_left_out_and_said_to_be(tmp_path):
+    final = {"final_games": 2, "steps": 100}
+    for arm, returns in (("a", (0, 1)), ("b", (0, 1)), ("c", (None, None))):
+        helpers.write_run(tmp_path / f"Catch/{arm}/seed0", returns, final=(1, 3), lr_rl=1e-3, **final)
+    metrics = tmp_path / "Catch/b/seed0/metrics.jsonl"
+    metrics.write_text(metrics.read_text().replace('"final/return_mean": 2.0', '"final/return_mean": null'))
+    page = Page(build(tmp_path))
+    cells = {arm: row[-1] for arm, row in page.table("Statistics of Catch").items()}
+    assert cells["a"].startswith("2.00") and cells["b"] == "–" and "c" not in cells
+    assert "Not compared: c: 1 of 1 seed left out: eval/return_mean is null in each row (seed 0)" in page.text

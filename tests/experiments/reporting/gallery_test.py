@@ -10,8 +10,8 @@ gallery = pytest.importorskip("experiments.reporting.gallery", reason="needs the
 def test_bands_of_few_runs_are_called_too_narrow(monkeypatch, seeds, narrow):
     told = []
     monkeypatch.setattr(gallery.pictures, "curves", lambda *_, across, **__: told.append(across))
-    returns = {"rl": np.linspace(-1, 1, 2 * seeds).reshape(seeds, 2)}
-    comparison = gallery.numbers.Comparison(np.array([0, 100]), returns, None)
+    ends = {"rl": {"at_the_end": np.linspace(-1, 1, seeds)}}
+    comparison = gallery.numbers.Comparison(100, ends, {}, None)
     (shown,) = gallery.profiles({"Catch": comparison}, {"rl": ("#000000", "-")}, None)
     assert shown.arms == ["rl"] * seeds
     assert [("too narrow" in text) for text in told] == [narrow]

@@ -12,6 +12,7 @@ from experiments.drawing import images
 from experiments.runs import collect
 from experiments.runs.collect import RunData
 from srl_jax.config import Config
+from srl_jax.run.ending import Ending
 from tests.experiments.reporting.report_test import write_run
 
 Image = pytest.importorskip("PIL.Image", reason="needs the extra plots")
@@ -32,12 +33,16 @@ def test_whether_a_run_is_finished():
     assert not numbers.finished(run([0, 100], [250]))  # the last evaluation is
     assert numbers.finished(run([0, 100], [100], stop_at_return=1.0))
     assert numbers.finished(run([], [250], mode="pretrain"))
+    # One seed of several has the return that all need, and was stopped.
+    stopped = run([0, 100], [100], stop_at_return=1.0)._replace(ended=Ending("stopped", 100))
+    assert not numbers.finished(stopped)
+    assert numbers.finished(run([0], [])._replace(ended=Ending("finished", 250)))
 
 
 def test_a_performance_profile_by_hand():
     # In Catch 0 is a miss, -1, and 1 a catch, 1: these end at 0.5 and 1, and at 0.
-    ends = {"rl": [[-1.0, 0.0], [-1.0, 1.0]], "joint": [[-1.0, -1.0]]}
-    comparison = numbers.Comparison(np.array([0, 100]), {arm: np.array(x) for arm, x in ends.items()}, None)
+    ends = {arm: {"at_the_end": np.array(x)} for arm, x in {"rl": [0.0, 1.0], "joint": [-1.0]}.items()}
+    comparison = numbers.Comparison(100, ends, {}, None)
     games, thresholds, found = numbers.profiles({"Catch": comparison})
     assert games == ["Catch"] and thresholds[0] < 0 and thresholds[-1] == 1.0
     rl, joint = found["rl"], found["joint"]

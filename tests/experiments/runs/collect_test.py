@@ -155,3 +155,30 @@ def test_arms_are_compared_where_all_of_them_have_curves():
     assert found["early"]["at_the_end"].tolist() == [1.0, 1.0]
     with pytest.raises(ConfigError, match="one begins at 2,500, another ends at 2,000"):
         collect.ends({"early": [(early[0][:2], early[1][:2])], "late": [late]})
+
+
+def test_an_end_that_the_sparsest_run_has_no_point_at_is_interpolated():
+    """Up to 350: the sparse run is at 3.5 and its mean 1.75; the dense one has a point between.
+
+    Its mean is (0 + 100 * (0 + 6) / 2 + 250 * 6) / 350.
+    """
+    sparse, dense = ([0, 400], [0.0, 4.0]), ([0, 100, 350], [0.0, 6.0, 6.0])
+    curves = [tuple(map(np.array, curve)) for curve in (sparse, dense)]
+    dense_area = (300 + 1500) / 350
+    for arms in ({"both": curves}, {"sparse": curves[:1], "dense": curves[1:]}):
+        until, found = collect.ends(arms)
+        areas, last = (
+            np.concatenate(x) for x in zip(*(each.values() for each in found.values()), strict=True)
+        )
+        assert until == 350 and areas == pytest.approx([1.75, dense_area])
+        assert last == pytest.approx([3.5, 6.0])
+
+
+def test_rows_that_are_not_in_order_are_refused(tmp_path):
+    run = write_run(tmp_path / "a/seed0", (0, 1, 2))
+    lines = (run / "metrics.jsonl").read_text().splitlines(keepends=True)
+    (run / "metrics.jsonl").write_text("".join(lines[::-1]))
+    with pytest.raises(
+        ConfigError, match="seed0: the env steps of eval/return_mean .* not in ascending order"
+    ):
+        collect.steps_and_returns(*collect.load_runs(tmp_path))
