@@ -218,6 +218,7 @@ def test_a_run_that_has_ended_says_so(capsys, loop, tmp_path):
     out = tmp_path / "run"
     train_in_process(*CATCH, f"--out={out}")
     checkpoint_of(out, 500, ended=True)
+    (out / "metrics.jsonl").unlink()
     capsys.readouterr()
     assert train_in_process(*CATCH, f"--out={out}", "--resume=auto") == 0
     line = f"the run in {out} has ended: 500 env steps"

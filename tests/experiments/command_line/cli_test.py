@@ -61,9 +61,8 @@ def test_a_colon_in_front_changes_options_and_keeps_the_rest():
         "rainbow:v_min=-2,v_max=3,hidden=128,noisy_std=0.5"
     )
     assert _config(preset, "--rl=dqn").rl == "dqn"
-    assert _config("--preset=thesis/rl_only_256", "--encoder=:features=9").encoder.startswith(
-        "sac_ae:features=9,init=he,"
-    )
+    encoder = _config("--preset=thesis/rl_only_256", "--encoder=:features=9").encoder
+    assert encoder == "sac_ae:features=9,gain=255"
 
 
 @pytest.mark.parametrize(
