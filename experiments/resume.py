@@ -38,6 +38,10 @@ def command_line(run: str) -> list[str]:
     seeds = sorted((folder.parent.name for folder in path.glob("seed*/config.json")), key=natural)
     if not seeds:
         raise ConfigError(f"{run}: not a run directory (no config.json)")
+    if root := next((root for root in path.absolute().parents[:2] if (root / FILE).is_file()), None):
+        raise ConfigError(
+            f"{run}: runs of a sweep, each by itself; name one of them, or give srl-jax sweep --out={root}"
+        )
     numbers = ",".join(name.removeprefix("seed") for name in seeds)
     return [f"--config={path / seeds[0] / 'config.json'}", f"--seeds={numbers}", *goes_on]
 

@@ -92,6 +92,11 @@ def test_a_directory_holds_a_single_run_or_seeds(capsys, loop, tmp_path):
     train_in_process(*CATCH, f"--out={tmp_path}/b", "--seeds=0,1", "--overwrite")
     assert {path.name for path in (tmp_path / "b").iterdir()} == {"seed0", "seed1"}
     assert resume.command_line(f"{tmp_path}/b")[1] == "--seeds=0,1"
+    # An arm of a sweep looks alike, and its runs are none of one process.
+    (tmp_path / "sweep.json").write_text("{}")
+    with pytest.raises(ConfigError, match=f"^{tmp_path}/b: runs of a sweep, each by itself"):
+        resume.command_line(f"{tmp_path}/b")
+    (tmp_path / "sweep.json").unlink()
     train_in_process(*CATCH, f"--out={tmp_path}/b", "--overwrite")
     assert {path.name for path in (tmp_path / "b").iterdir()} == {"config.json", "metrics.jsonl"}
     # What lies beside seeds may be anything.
