@@ -13,11 +13,11 @@ from absl import flags
 from srl_jax.errors import ConfigError
 from srl_jax.files import display
 from srl_jax.files.checkpoint import Manifest
-from srl_jax.files.metrics import read_metrics
 from srl_jax.specs import Info
 
 from .command_line import flags as config_flags
 from .command_line import paths, runtime
+from .runs.run_data import read_rows
 
 FLAGS = flags.FLAGS
 
@@ -48,14 +48,8 @@ def check_final(manifest: Manifest) -> None:
     for name in ("games", "envs", "seed", "epsilon"):
         if FLAGS[name].present:
             raise ConfigError(f"--{name}={FLAGS[name].value}: given beside --final, which has the run's own")
-    rows = manifest.path.parents[1] / "metrics.jsonl"
-    try:
-        played = [row["env_steps"] for row in read_metrics(rows) if row["kind"] == "final"]
-    except OSError as error:
-        raise ConfigError(f"--final: {rows}: {error.strerror}") from None
-    except ValueError as error:
-        raise ConfigError(f"--final: {error}") from None
-    if manifest.env_steps not in played:
+    rows = read_rows(manifest.path.parents[1] / "metrics.jsonl")
+    if not any(row["kind"] == "final" and row["env_steps"] == manifest.env_steps for row in rows):
         raise ConfigError(
             f"--final: no final games were played by {manifest.path}; name a run that has ended, or give "
             "--games=100, say"

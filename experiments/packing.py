@@ -79,16 +79,16 @@ def read(folder: Path, *, only_last: bool = False, mend: bool = False) -> list[R
         try:
             config = Config.from_values(about)
             ended = Ending(**run["ended"]) if run["ended"] else None
-            place = folder / run["path"]
-            if Path(run["path"]).is_absolute() or ".." in Path(run["path"]).parts:
-                raise TypeError(f"{run['path']} is not below the folder")
+            below = Path(run["path"])
+            if below.is_absolute() or ".." in below.parts:
+                raise TypeError(f"{below} is not below the folder")
         except (KeyError, TypeError) as error:
             raise ConfigError(f"{path}: not what packing writes ({error})") from None
         except ConfigError as error:
             raise ConfigError(f"{path}: {run.get('path')}: {error}") from None
         its = rows.pop((config.game, arm, config.seed), [])
         check_rows(its, f"{folder / ROWS}: {run['path']}")
-        runs.append(RunData(place, config.game, arm, config.seed, config, its, ended, about))
+        runs.append(RunData(folder / below, config.game, arm, config.seed, config, its, ended, about))
     if rows:
         said = f"{folder / ROWS}: rows of {_name(*next(iter(rows)))}, which {CONFIGS} does not have"
         if not mend:
