@@ -139,8 +139,12 @@ def test_an_option_changes_something_or_is_refused(kind, row):
                 assert "met" in settings(kind, row, option, defaults), f"{option} is never read"
 
 
+LEAN = "hidden=8,atoms=5,double=false,dueling=false,noisy=false"
+"""Options of `rainbow` with which it is traced fast."""
+
+
 def with_rl(options: str) -> dict:
-    return {"rl": f"rainbow:hidden=8,atoms=5,{options}"}
+    return {"rl": f"rainbow:{LEAN},{options}"}
 
 
 def with_objectives(*texts: str, mode: str = "joint", **values) -> dict:
@@ -228,7 +232,7 @@ OF_HOST = {
 
 def base(name: str, **values) -> Config:
     unread = {"eval_games", "slow_update_every"} | ({"rl"} if "pretrain" in str(BASES[name]) else set())
-    small = {**SMALL, "rl": "rainbow:hidden=8,atoms=5", "diagnostics": True}
+    small = {**SMALL, "rl": f"rainbow:{LEAN}", "diagnostics": True}
     return Config(**{**{k: x for k, x in small.items() if k not in unread}, **BASES[name], **values})
 
 

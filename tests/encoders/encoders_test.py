@@ -53,9 +53,11 @@ def test_parameter_counts_and_features_at_84_pixels(name, options, features, num
     assert (z.shape, z.dtype) == ((2, features), jnp.float32)
 
 
-@pytest.mark.parametrize("extra", [0, 6])
+SHAPES = [(84, 84, 4), (40, 40, 4), (42, 42, 4), (56, 56, 4), (64, 64, 12), (96, 96, 9), (41, 73, 6)]
+
+
 @pytest.mark.parametrize(
-    "shape", [(84, 84, 4), (40, 40, 4), (42, 42, 4), (56, 56, 4), (64, 64, 12), (96, 96, 9), (41, 73, 6)]
+    ("shape", "extra"), [*((shape, 0) for shape in SHAPES), (SHAPES[0], 6), (SHAPES[-1], 6)]
 )
 @pytest.mark.parametrize("name", encoders.REGISTRY)
 def test_decoders_mirror_their_encoder(name, shape, extra):
