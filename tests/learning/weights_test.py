@@ -173,7 +173,8 @@ RUN = Config(
     **SMALL
     | dict(
         mode="joint", objectives=("inverse:weight=ratio:0.2->0.1@100",), srl_every=2, updates_per_step=0.5,
-        num_envs=2, learn_start=20, rl="dqn:hidden=16", log_every=20, steps=80, eval_every=80, eval_games=1, eval_max_steps=30,
+        num_envs=2, learn_start=20, log_every=20, steps=80, eval_every=80, eval_games=1, eval_max_steps=30,
+        rl="dqn:hidden=16",
     )
 )  # fmt: skip
 
