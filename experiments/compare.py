@@ -27,7 +27,6 @@ from .drawing.colours import styles
 from .runs import collect
 from .runs.run_data import RunData
 
-FLAGS = flags.FLAGS
 LONGEST = 40
 """Characters of a label that says what differs; where it would be longer, it is the arm's name."""
 
@@ -198,7 +197,7 @@ def draw(arms: Sequence[Arm], key: str, notes: Sequence[str], path: Path, among:
     plots.draw_panels(panels, path, "", note, dict(zip(names, looks, strict=True)), key)
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_multi_string(
         "runs", None, "directories of runs, at least two curves; the name may be left out", flag_values=values
@@ -238,17 +237,7 @@ def compare(values: flags.FlagValues) -> None:
     display.result(text)
 
 
-def main(argv: list[str]) -> None:
-    """The entry point."""
-    del argv
-    compare(FLAGS)
-
-
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(main, positional="runs")
-
+cli = config_flags.program(compare, define_flags, positional="runs")
 
 if __name__ == "__main__":
     cli()

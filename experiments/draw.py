@@ -14,31 +14,31 @@ from srl_jax.errors import ConfigError
 from .command_line import flags as config_flags
 from .drawing import plots, run_figures
 
-FLAGS = flags.FLAGS
 
-
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    if not FLAGS.run:
+    if not values.run:
         raise ConfigError("--run: missing; name a run directory, srl-jax draw runs/NAME")
-    config = Config.load(FLAGS.run)
+    config = Config.load(values.run)
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
     try:
-        written = run_figures.draw_run(Path(FLAGS.run), config, thesis=FLAGS.thesis)
+        written = run_figures.draw_run(Path(values.run), config, thesis=values.thesis)
     except OSError as error:
-        raise ConfigError(f"--run={FLAGS.run}: {error.filename}: {error.strerror}") from None
+        raise ConfigError(f"--run={values.run}: {error.filename}: {error.strerror}") from None
     for path in written:
         print(path)
 
 
-def cli() -> None:
-    """Runs this entry point as a program."""
-    flags.DEFINE_string("run", "", "run directory")
-    flags.DEFINE_string("thesis", "", "FIGURE/ARM, a curve of the thesis to draw beside the run's")
-    config_flags.run(main, positional="run")
+def define_flags(values: flags.FlagValues) -> None:
+    """Defines this entry point's flags."""
+    flags.DEFINE_string("run", "", "run directory", flag_values=values)
+    flags.DEFINE_string(
+        "thesis", "", "FIGURE/ARM, a curve of the thesis to draw beside the run's", flag_values=values
+    )
 
+
+cli = config_flags.program(main, define_flags, positional="run")
 
 if __name__ == "__main__":
     cli()

@@ -19,8 +19,6 @@ from .command_line import flags as config_flags
 from .command_line import paths, runtime
 from .runs.run_data import read_rows
 
-FLAGS = flags.FLAGS
-
 
 def check_gif(path: str) -> None:
     """Whether a GIF can be written there.
@@ -35,19 +33,19 @@ def check_gif(path: str) -> None:
     paths.check_file("gif", path, ".gif")
 
 
-def check_final(manifest: Manifest) -> None:
+def check_final(manifest: Manifest, values: flags.FlagValues) -> None:
     """Whether --final stands alone, and the run has played final games by these parameters.
 
     Raises:
         ConfigError: it does not, or has not; or its rows cannot be read.
     """
-    if not FLAGS.final:
+    if not values.final:
         return
     if not manifest.config.final_games:
-        raise ConfigError(f"--final: the run in {FLAGS.run} has no final games; give --games=100, say")
+        raise ConfigError(f"--final: the run in {values.run} has no final games; give --games=100, say")
     for name in ("games", "envs", "seed", "epsilon"):
-        if FLAGS[name].present:
-            raise ConfigError(f"--{name}={FLAGS[name].value}: given beside --final, which has the run's own")
+        if values[name].present:
+            raise ConfigError(f"--{name}={values[name].value}: given beside --final, which has the run's own")
     rows = read_rows(manifest.path.parents[1] / "metrics.jsonl")
     if not any(row["kind"] == "final" and row["env_steps"] == manifest.env_steps for row in rows):
         raise ConfigError(
@@ -56,29 +54,28 @@ def check_final(manifest: Manifest) -> None:
         )
 
 
-def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> None:
+def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = None) -> None:
     """The entry point.
 
     Args:
-        argv: the program's name.
+        values: parsed flags, as `define_flags` defines them.
         prepare: called with --tune_runtime and the run's encoder before jax is imported. It may replace the
             process, so only a process of our own gives it.
     """
-    del argv
-    if not FLAGS.run:
+    if not values.run:
         raise ConfigError("--run: missing; name a run directory or a checkpoint, srl-jax evaluate runs/NAME")
-    if FLAGS.gif:
-        check_gif(FLAGS.gif)
+    if values.gif:
+        check_gif(values.gif)
     from srl_jax.files import checkpoint
     from srl_jax.learning.modes import MODES
 
-    manifest = checkpoint.read_manifest(FLAGS.run)
+    manifest = checkpoint.read_manifest(values.run)
     config = manifest.config
     if not MODES[config.mode].rl:
-        raise ConfigError(f"--run={FLAGS.run}: a run of --mode={config.mode} has no policy to play with")
-    check_final(manifest)
+        raise ConfigError(f"--run={values.run}: a run of --mode={config.mode} has no policy to play with")
+    check_final(manifest, values)
     if prepare is not None:
-        prepare(FLAGS.tune_runtime, config.encoder)
+        prepare(values.tune_runtime, config.encoder)
 
     runtime.check_device()
 
@@ -88,10 +85,11 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
     from srl_jax.run import actor, evaluations
     from srl_jax.run.evaluate import evaluate
 
-    loaded = loading.load(FLAGS.run, imports=FLAGS["import"].value)
-    manifest, seed = loaded.manifest, FLAGS.seed
-    games, at_once, key = FLAGS.games, FLAGS.envs or config.eval_envs or config.num_envs, jax.random.key(seed)
-    if FLAGS.final:
+    loaded = loading.load(values.run, imports=values["import"].value)
+    manifest, seed = loaded.manifest, values.seed
+    games, at_once = values.games, values.envs or config.eval_envs or config.num_envs
+    key = jax.random.key(seed)
+    if values.final:
         games, at_once, seed, key = evaluations.games(config, evaluations.FINAL, manifest.env_steps)
     policy = loaded.policy(key)
     env = actor.make_env(config, "eval", min(games, at_once), seed=seed)
@@ -107,10 +105,10 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         env,
         games=games,
         seed=seed,
-        epsilon=config.eps_eval if FLAGS.epsilon is None else FLAGS.epsilon,
+        epsilon=config.eps_eval if values.epsilon is None else values.epsilon,
         stack=config.frame_stack,
         max_steps=config.eval_max_steps,
-        record=config.eval_max_steps + 1 if FLAGS.gif else 0,
+        record=config.eval_max_steps + 1 if values.gif else 0,
     )
     result = {
         "game": config.game,
@@ -119,14 +117,14 @@ def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> 
         "returns": played.returns,
         "lengths": played.lengths,
     }
-    if FLAGS.gif:
+    if values.gif:
         from .drawing import images
 
-        images.gif(played.frames[: played.lengths[0] + 1], FLAGS.gif)  # the first game
+        images.gif(played.frames[: played.lengths[0] + 1], values.gif)  # the first game
     display.result(json.dumps(result))
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", flag_values=values)
     games = Info(int, "full games to play", minimum=1, maximum=1_000_000)
@@ -144,11 +142,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     config_flags.define_runtime_flag(values)
 
 
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(functools.partial(main, prepare=runtime.prepare), positional="run")
-
+cli = config_flags.program(functools.partial(main, prepare=runtime.prepare), define_flags, positional="run")
 
 if __name__ == "__main__":
     cli()

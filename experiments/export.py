@@ -14,22 +14,19 @@ from srl_jax.errors import ConfigError
 from .command_line import flags as config_flags
 from .command_line import paths, runtime
 
-FLAGS = flags.FLAGS
 
-
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    if not FLAGS.run:
+    if not values.run:
         raise ConfigError("--run: missing; name a run directory or a checkpoint, srl-jax export runs/NAME")
-    if not FLAGS.encoder:
+    if not values.encoder:
         raise ConfigError("--encoder: missing; name the file to write, --encoder=enc.npz")
-    path = paths.check_file("encoder", FLAGS.encoder, ".npz", overwrite=FLAGS.overwrite)
+    path = paths.check_file("encoder", values.encoder, ".npz", overwrite=values.overwrite)
     runtime.check_device()
 
     from srl_jax import encoders, loading
 
-    loaded = loading.load(FLAGS.run, imports=FLAGS["import"].value)
+    loaded = loading.load(values.run, imports=values["import"].value)
     config, encoder = loaded.config, loaded.encoder
     about = {"game": config.game, "env_steps": loaded.env_steps}
     encoders.to_npz(path, encoder, loaded.params["encoder"], config.encoder, **about)
@@ -37,7 +34,7 @@ def main(argv: list[str]) -> None:
     print(f"{path}: {config.encoder.partition(':')[0]}, observations {shape} to {encoder.features} numbers")
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     run = "run directory, one of its checkpoints, or an encoder that was kept"
     flags.DEFINE_string("run", "", run, flag_values=values)
@@ -46,11 +43,7 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     config_flags.define_import_flag(values)
 
 
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(main, positional="run")
-
+cli = config_flags.program(main, define_flags, positional="run")
 
 if __name__ == "__main__":
     cli()

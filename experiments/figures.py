@@ -44,8 +44,6 @@ from .sweeping import launching, manifest, options, probe, status
 from .sweeping.plan import Arm, Planned, parse_seeds, plan
 from .sweeping.plan import presets as matching
 
-FLAGS = flags.FLAGS
-
 TWO = 2
 """So many runs are drawn themselves: their t interval is nine standard deviations wide to either side."""
 
@@ -231,7 +229,7 @@ def left_out_lines(numbers: Mapping[str, Any]) -> list[str]:
     return lines
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     options.define_flags(values)
     flags.DEFINE_string(
@@ -430,17 +428,7 @@ def _names(text: str, known: Iterable[str]) -> list[str]:
     return names
 
 
-def main(argv: list[str]) -> int:
-    """The entry point."""
-    del argv
-    return run(FLAGS)
-
-
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(main)
-
+cli = config_flags.program(run, define_flags)
 
 if __name__ == "__main__":
     cli()

@@ -33,8 +33,6 @@ from .command_line import flags as config_flags
 from .command_line import paths
 from .runs.run_data import RunData, check_rows, in_order, load_run, run_directories, runs_below
 
-FLAGS = flags.FLAGS
-
 CONFIGS = "configs.json"
 """[{"arm": its name, "config": the fields that its runs on a game share, "runs": [{"path": below the folder,
 "config": its own fields, "ended": as ended.json, or null}]}], sorted as the runs are."""
@@ -274,7 +272,7 @@ def _rows(path: Path, only_last: bool) -> dict[tuple[str, str, int], list[dict[s
     return found
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_string("runs", None, "directory in or below which the runs are", flag_values=values)
     flags.DEFINE_string("out", None, "folder of the campaign; runs are added to it", flag_values=values)
@@ -285,23 +283,22 @@ def define_flags(values: flags.FlagValues = FLAGS) -> None:
     flags.DEFINE_boolean("stopped", False, text, flag_values=values)
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
     for name in ("runs", "out"):
-        if not FLAGS[name].value:
+        if not values[name].value:
             raise ConfigError(f"--{name}: missing; name a directory")
-    runs, out = Path(os.path.expanduser(FLAGS.runs)), paths.check_place("out", FLAGS.out)
+    runs, out = Path(os.path.expanduser(values.runs)), paths.check_place("out", values.out)
     if not runs.is_dir():
-        raise ConfigError(f"--runs={FLAGS.runs}: no such directory")
+        raise ConfigError(f"--runs={values.runs}: no such directory")
     one, other = runs.resolve(), out.resolve()
-    if not FLAGS.unpack and (one == other or one in other.parents or other in one.parents):
-        raise ConfigError(f"--out={FLAGS.out}: name a folder that is neither in --runs nor around it")
+    if not values.unpack and (one == other or one in other.parents or other in one.parents):
+        raise ConfigError(f"--out={values.out}: name a folder that is neither in --runs nor around it")
     try:
-        if FLAGS.unpack:
+        if values.unpack:
             print(f"{out}: {unpack(runs, out)} runs unpacked")
         else:
-            more, count, left_out = pack(runs, out, stopped=FLAGS.stopped)
+            more, count, left_out = pack(runs, out, stopped=values.stopped)
             for path in left_out:
                 display.say(f"{path}: left out: it is under way, or was stopped or killed and can be resumed")
             print(f"{out}: {more} runs added, {count} in all")
@@ -309,11 +306,7 @@ def main(argv: list[str]) -> None:
         raise SaveError(f"--out={out}: {error.strerror or error}") from error
 
 
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(main, positional="runs")
-
+cli = config_flags.program(main, define_flags, positional="runs")
 
 if __name__ == "__main__":
     cli()

@@ -27,7 +27,6 @@ from srl_jax.specs import Info, choices_text
 from .command_line import flags as config_flags
 from .runs import collect
 
-FLAGS = flags.FLAGS
 PUBLISHED = "published"
 POOLED = "all arms"
 FEWEST = 3
@@ -143,7 +142,7 @@ def table(
     return ["  ".join(map(str.ljust, line, widths)).rstrip() for line in lines]
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     positive = Info(
         float, "true difference between the means of the two arms", unit="of the score", minimum=1e-9
@@ -227,17 +226,12 @@ def _positive(text: str, given: Sequence[str]) -> float:
     return number
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    display.result("\n".join(report(FLAGS)))
+    display.result("\n".join(report(values)))
 
 
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(main)
-
+cli = config_flags.program(main, define_flags)
 
 if __name__ == "__main__":
     cli()

@@ -35,8 +35,6 @@ from .command_line import paths
 from .command_line.stopping import signals
 from .train import check_extras
 
-FLAGS = flags.FLAGS
-
 MOST_ENVS = 100
 """Games that are played side by side."""
 PROTOCOL = ("sticky_actions", "noop_max", "eval_max_steps")
@@ -157,7 +155,7 @@ def _chosen(flag: str, given: Sequence[str], valid: Sequence[str]) -> list[str]:
     return list(dict.fromkeys(given))
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_list("games", ["Catch"], "to play", flag_values=values)
     flags.DEFINE_list("policies", list(POLICIES), "to play them with", flag_values=values)
@@ -217,12 +215,7 @@ def _check_out(text: str) -> Path:
     return path
 
 
-def main(argv: list[str]) -> int:
-    """The entry point."""
-    del argv
-    return run(FLAGS)
-
+cli = config_flags.program(run, define_flags)
 
 if __name__ == "__main__":
-    define_flags()
-    config_flags.run(main)
+    cli()

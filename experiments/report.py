@@ -20,12 +20,11 @@ from srl_jax.files.reading import replace_text
 from .command_line import flags as config_flags
 from .command_line import paths
 
-FLAGS = flags.FLAGS
 NEEDED = {"jinja2": "Jinja2", "markdown_it": "markdown-it-py", "matplotlib": "matplotlib", "PIL": "Pillow"}
 """Modules of the extra `plots`, by which a page is made, and their packages."""
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     kinds = (flags.DEFINE_string, flags.DEFINE_boolean, flags.DEFINE_multi_string)
     text, yes, texts = (functools.partial(kind, flag_values=values) for kind in kinds)
@@ -102,19 +101,14 @@ def report(values: flags.FlagValues) -> Path:
     return path
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    path = report(FLAGS)
+    path = report(values)
     for file in (path, path.with_suffix(".csv")):
         print(f"{file}: {file.stat().st_size / 1e3:,.0f} kB")
 
 
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(main, positional="runs")
-
+cli = config_flags.program(main, define_flags, positional="runs")
 
 if __name__ == "__main__":
     cli()

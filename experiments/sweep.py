@@ -26,10 +26,8 @@ from .runs import collect
 from .sweeping import launching, manifest, options, plan, states, status
 from .sweeping.plan import Planned
 
-FLAGS = flags.FLAGS
 
-
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     options.define_flags(values)
     flags.DEFINE_list(
@@ -87,25 +85,24 @@ def status_lines(root: Path, workers: int) -> list[str]:
     return [*status.lines(root, entries, workers), at_work]
 
 
-def main(argv: list[str]) -> int:
+def main(values: flags.FlagValues) -> int:
     """The entry point; returns the exit status."""
-    del argv
-    if not FLAGS.out:
+    if not values.out:
         raise ConfigError("--out: missing; name a directory for the sweep, --out=runs/NAME")
-    root = paths.check_place("out", FLAGS.out)
-    if FLAGS.status:
-        for name in ("presets", "games", "seeds", "grid", "dry_run", *options.given_flags(FLAGS)):
-            if FLAGS[name].present:
+    root = paths.check_place("out", values.out)
+    if values.status:
+        for name in ("presets", "games", "seeds", "grid", "dry_run", *options.given_flags(values)):
+            if values[name].present:
                 raise ConfigError(f"--{name}: --status tells of the sweep that is in --out; leave it out")
-    how = options.launcher_options(FLAGS)
+    how = options.launcher_options(values)
     workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
-    if FLAGS.status:
+    if values.status:
         display.result("\n".join(status_lines(root, workers)))
         return 0
-    runs = chosen_runs(FLAGS, root)
-    options.say_what_is_replaced(FLAGS, runs)
+    runs = chosen_runs(values, root)
+    options.say_what_is_replaced(values, runs)
     entries = manifest.resolve(runs)
-    if FLAGS.dry_run:
+    if values.dry_run:
         display.result("\n".join(status.dry_run(root, entries, workers)))
         return 0
     try:
@@ -114,15 +111,11 @@ def main(argv: list[str]) -> int:
             if lines := status.best(collect.load_named(root, entries)):
                 display.result("\n".join(lines))
     except OSError as error:
-        raise SaveError(f"--out={FLAGS.out}: {error.strerror or error}") from error
+        raise SaveError(f"--out={values.out}: {error.strerror or error}") from error
     return code
 
 
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(main)
-
+cli = config_flags.program(main, define_flags)
 
 if __name__ == "__main__":
     cli()

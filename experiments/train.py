@@ -39,10 +39,8 @@ from .command_line import flags as config_flags
 from .command_line import paths, runtime
 from .command_line.stopping import signals
 
-FLAGS = flags.FLAGS
 
-
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     config_flags.define_config_flags(values)
     config_flags.define_runtime_flag(values)
@@ -320,17 +318,7 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
             raise SaveError(f"{path}: no figures: {error.strerror}") from error
 
 
-def main(argv: list[str], prepare: Callable[[str, str], None] | None = None) -> int:
-    """The entry point; `prepare` and the status as of `train`."""
-    del argv
-    return train(FLAGS, prepare)
-
-
-def cli() -> None:
-    """Runs this entry point as a program."""
-    define_flags()
-    config_flags.run(functools.partial(main, prepare=runtime.prepare))
-
+cli = config_flags.program(functools.partial(train, prepare=runtime.prepare), define_flags)
 
 if __name__ == "__main__":
     cli()

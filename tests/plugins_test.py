@@ -252,11 +252,7 @@ def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path, 
 
     # It moved: what is typed beside a program counts.
     def evaluated(*arguments):
-        def main(values):
-            monkeypatch.setattr(evaluate, "FLAGS", values)
-            evaluate.main(["evaluate"])
-
-        _called(main, evaluate.define_flags, [f"--run={run}", "--games=2", *arguments])
+        _called(evaluate.main, evaluate.define_flags, [f"--run={run}", "--games=2", *arguments])
         return json.loads(capsys.readouterr().out)
 
     fresh()

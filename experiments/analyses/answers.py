@@ -37,7 +37,6 @@ from ..runs import collect
 from ..runs.run_data import RunData
 from .populations import RESULTS
 
-FLAGS = flags.FLAGS
 ROOT = RESULTS.parents[1]
 PAGE, README = ROOT / "docs" / "answers.md", ROOT / "README.md"
 ANALYSES = {"claims": "interval_claims", "coverage": "coverage", "predictors": "diagnostics_predict"}
@@ -220,9 +219,8 @@ def contents(results: Path = RESULTS) -> dict[Path, bytes]:
     return {path: path.read_bytes() for path in [PAGE, README, *paths]}
 
 
-def main(argv: list[str]) -> int:
+def main(_: flags.FlagValues) -> int:
     """The entry point."""
-    del argv
     before, todo = contents(), list(commands())
     with display.Progress(len(todo), "redrawn") as progress:
         for done, (what, arguments) in enumerate(todo):
@@ -244,4 +242,4 @@ def main(argv: list[str]) -> int:
 
 
 if __name__ == "__main__":
-    config_flags.run(main)
+    config_flags.program(main, lambda values: None)()

@@ -22,7 +22,6 @@ from ..command_line import flags as config_flags
 from ..drawing import plots
 from . import coverage, output, populations
 
-FLAGS = flags.FLAGS
 SEEDS = (3, 5)
 """Of each arm, that a claim is made from."""
 REPETITIONS = 10_000
@@ -302,15 +301,14 @@ def draw(found: Mapping[str, Any], path: Path) -> Path:
     return plots.save(figure, path)
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     output.define_out("claims.json, .md and .png", values)
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    out = output.place(FLAGS.out, drawn=True)
+    out = output.place(values.out, drawn=True)
     found = analyse(populations.chosen())
     display.result(tables(found))
     if out is not None:
@@ -319,5 +317,4 @@ def main(argv: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    define_flags()
-    config_flags.run(main)
+    config_flags.program(main, define_flags)()

@@ -20,7 +20,6 @@ from srl_jax.specs import Info
 from ..command_line import flags as config_flags
 from . import output, populations
 
-FLAGS = flags.FLAGS
 RUNS = (2, 3, 5, 7, 10, 20)
 """Of each arm, and of each game."""
 GAMES = 5
@@ -261,22 +260,21 @@ def lines(found: Mapping[str, Mapping[str, Sequence[float | None]]]) -> list[str
     return shown
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     info = Info(int, "simulated for each number of the table", minimum=1, maximum=1_000_000)
     config_flags.define("experiments", info, 10_000, values)
     output.define_out("coverage.json", values)
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    out = output.place(FLAGS.out, drawn=False)
-    found = table(FLAGS.experiments, sources())
+    out = output.place(values.out, drawn=False)
+    found = table(values.experiments, sources())
     display.result("\n".join(lines(found)))
     if out is not None:
         content = {
-            "experiments": FLAGS.experiments,
+            "experiments": values.experiments,
             "repetitions": REPETITIONS,
             "runs": RUNS,
             "covered": found,
@@ -285,5 +283,4 @@ def main(argv: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    define_flags()
-    config_flags.run(main)
+    config_flags.program(main, define_flags)()

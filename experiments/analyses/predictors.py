@@ -22,7 +22,6 @@ from ..runs.run_data import RunData
 from . import output, populations
 from .populations import ChosenArm
 
-FLAGS = flags.FLAGS
 MOMENTS = (9_000, 18_000)
 """Env steps of the evaluations that predict."""
 GAMES = ("Catch", "CatchDistractor")
@@ -325,15 +324,14 @@ def draw(rows: Sequence[Mapping[str, Any]], path: Path) -> Path:
     return plots.save(figure, path)
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     output.define_out("predictors.json, .md and .png", values)
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    out = output.place(FLAGS.out, drawn=True)
+    out = output.place(values.out, drawn=True)
     rows = analyse(populations.chosen())
     display.result(tables(rows))
     if out is not None:
@@ -343,5 +341,4 @@ def main(argv: list[str]) -> None:
 
 
 if __name__ == "__main__":
-    define_flags()
-    config_flags.run(main)
+    config_flags.program(main, define_flags)()

@@ -34,7 +34,6 @@ from ..command_line import paths, runtime
 from .rows import GROUPS, OF_OBJECTIVES, Group
 from .worker import ROOT, Worker, WorkerError
 
-FLAGS = flags.FLAGS
 PYTHON = ".venv-bench/bin/python"
 ROWS = {name: row for group in (*GROUPS, *OF_OBJECTIVES) for name, row in group.rows.items()}
 MAIN = [name for group in GROUPS for name in group.rows]
@@ -52,7 +51,7 @@ class CheckFailed(RuntimeError):
     """The two sides do not compute the same."""
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     config_flags.define("rounds", Info(int, "how often each worker takes its turn", minimum=1), 7, values)
     flags.DEFINE_list(
@@ -268,15 +267,13 @@ def bench(values: flags.FlagValues) -> None:
         (path / "bench.md").write_text(text, encoding="utf-8")
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
     try:
-        bench(FLAGS)
+        bench(values)
     except (WorkerError, CheckFailed) as error:
         sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":
-    define_flags()
-    config_flags.run(main)
+    config_flags.program(main, define_flags)()

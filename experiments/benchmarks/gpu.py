@@ -20,11 +20,10 @@ from ..command_line import flags as config_flags
 from .bench import check_out
 from .rows import JOINT, NATURE, number, spread, spread_text
 
-FLAGS = flags.FLAGS
 WARM_UPDATES = 20
 
 
-def define_flags(values: flags.FlagValues = FLAGS) -> None:
+def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_enum("device", "gpu", ["gpu", "cpu"], "cpu: only to try this program", flag_values=values)
     config_flags.define("updates", Info(int, "updates timed for each figure", minimum=1), 500, values)
@@ -91,16 +90,14 @@ def measure(values: flags.FlagValues) -> dict[str, Any]:
     return about | {"figures": figures}
 
 
-def main(argv: list[str]) -> None:
+def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    del argv
-    path = check_out(FLAGS.out)
-    found = measure(FLAGS)
+    path = check_out(values.out)
+    found = measure(values)
     if path is not None:
         path.mkdir(parents=True, exist_ok=True)
         (path / "gpu.json").write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
 
 
 if __name__ == "__main__":
-    define_flags()
-    config_flags.run(main)
+    config_flags.program(main, define_flags)()

@@ -82,5 +82,4 @@ def prepare(tune: str, encoder: str) -> None:
 
 
 if __name__ == "__main__":
-    train.define_flags()
-    config_flags.run(functools.partial(train.main, prepare=prepare))
+    config_flags.program(functools.partial(train.train, prepare=prepare), train.define_flags)()

@@ -356,16 +356,27 @@ def guarded(main: Callable[[list[str]], Any]) -> Callable[[list[str]], Any]:
     return call
 
 
-def run(main: Callable[[list[str]], Any], positional: str | None = None) -> None:
-    """Runs an entry point: parses the flags, and ends with a line and a status where it fails; see `guarded`.
+def program(
+    run: Callable[[flags.FlagValues], Any],
+    define_flags: Callable[[flags.FlagValues], Any],
+    positional: str | None = None,
+) -> Callable[[], None]:
+    """What runs an entry point: it defines and parses the flags, and ends as `guarded` does.
 
     Args:
-        main: takes [the program's name]; may return the exit status. Its module's docstring begins --help.
+        run: takes the flags; may return the exit status. Its module's docstring begins --help.
+        define_flags: defines them.
         positional: see `parse`.
     """
-    # absl prints what libraries log, and jax logs every accelerator that it does not find.
-    logging.getLogger("jax").setLevel(logging.WARNING)
-    display.secure()
-    function = main.func if isinstance(main, functools.partial) else main
-    about = sys.modules[function.__module__].__doc__ or ""
-    app.run(guarded(main), flags_parser=functools.partial(parse, positional=positional, about=about))
+
+    def cli() -> None:
+        # absl prints what libraries log, and jax logs every accelerator that it does not find.
+        logging.getLogger("jax").setLevel(logging.WARNING)
+        display.secure()
+        define_flags(flags.FLAGS)
+        function = run.func if isinstance(run, functools.partial) else run
+        about = sys.modules[function.__module__].__doc__ or ""
+        main = guarded(lambda _: run(flags.FLAGS))
+        app.run(main, flags_parser=functools.partial(parse, positional=positional, about=about))
+
+    return cli

@@ -233,10 +233,9 @@ def test_bad_flags_are_refused_before_anything_is_measured(argument, message, tm
 
 def test_a_failed_check_is_one_line_and_status_1(monkeypatch, tmp_path, asked):
     asked.their_loss = 1.1
-    monkeypatch.setattr(bench, "FLAGS", _values("--only=update_nature", f"--out={tmp_path}/new"))
     monkeypatch.setattr(bench, "other_versions", lambda _: {"torch": "2"})
     with pytest.raises(SystemExit) as end:
-        bench.main([])
+        bench.main(_values("--only=update_nature", f"--out={tmp_path}/new"))
     assert end.value.code.startswith("error: a loss differs")  # Python prints it, with status 1
     assert not (tmp_path / "new").exists()
 

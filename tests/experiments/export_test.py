@@ -27,15 +27,14 @@ def run(tmp_path_factory):
 
 
 @pytest.fixture
-def exported(monkeypatch):
+def exported():
     """Runs the command, whose arguments it takes."""
 
     def call(*arguments):
         values = flags.FlagValues()
         export.define_flags(values)
         config_flags.parse(["export", *map(str, arguments)], values, positional="run")
-        monkeypatch.setattr(export, "FLAGS", values)
-        export.main(["export"])
+        export.main(values)
 
     return call
 

@@ -228,13 +228,12 @@ def test_packed_runs_are_not_run_again_in_their_place_nor_counted_twice(root, tm
     assert collect.arm_names(root) == ["alone", "joint_256", "rl_only_nature"]
 
 
-def test_the_command_line(root, tmp_path, monkeypatch, capsys):
+def test_the_command_line(root, tmp_path, capsys):
     def main(*arguments):
         values = flags.FlagValues()
         packing.define_flags(values)
         config_flags.parse(["packing", *map(str, arguments)], values, "runs")
-        monkeypatch.setattr(packing, "FLAGS", values)
-        packing.main(["packing"])
+        packing.main(values)
 
     main(root, f"--out={tmp_path / 'out'}")
     main(tmp_path / "out", f"--out={tmp_path / 'again'}", "--unpack")

@@ -251,12 +251,12 @@ def test_a_run_loses_no_row_when_the_reader_of_its_progress_goes(tmp_path, monke
 
 CODE = """
 from experiments.command_line import flags
-def main(argv):
+def main(values):
     print("Gem\\u00e4lde " * 10_000, flush=True)
     with open("file", "w") as file:
         assert file.fileno() > 2
     return 7
-flags.run(main)
+flags.program(main, lambda values: None)()
 """
 
 

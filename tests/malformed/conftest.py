@@ -6,7 +6,6 @@ What a message says exactly is tested where it is made; here it must name the fl
 import os
 import shutil
 import signal
-from unittest import mock
 
 import pytest
 from absl import flags
@@ -60,11 +59,8 @@ def source(valid, folder):
 def call(program, *arguments):
     """Runs an entry point in this process, with flags of its own; returns its exit status."""
     module, values = {"train": train, "evaluate": evaluate, "draw": draw}[program], flags.FlagValues()
-    if program == "draw":
-        for name in ("run", "thesis"):
-            flags.DEFINE_string(name, "", "", flag_values=values)
-    else:
-        module.define_flags(values)
+    main = train.train if module is train else module.main
+    module.define_flags(values)
 
     def late(*_):
         raise TimeoutError(arguments)
@@ -72,9 +68,8 @@ def call(program, *arguments):
     handler = signal.signal(signal.SIGALRM, late)
     signal.alarm(LIMIT_S)
     try:
-        with mock.patch.object(module, "FLAGS", values):
-            config_flags.parse([program, *last_of_each(arguments)], values)
-            return config_flags.guarded(module.main)([program]) or 0
+        config_flags.parse([program, *last_of_each(arguments)], values)
+        return config_flags.guarded(lambda _: main(values))([program]) or 0
     except SystemExit as ended:
         return ended.code
     finally:

@@ -1,7 +1,6 @@
 """What the documentation says: links lead somewhere, commands parse, registries are complete, code works."""
 
 import collections
-import copy
 import json
 import re
 import runpy
@@ -84,18 +83,18 @@ def test_every_page_can_be_reached_from_the_readme():
 def _parse(monkeypatch, module, commands):
     """Defines the flags of a module and parses command lines with them, in place of running it."""
 
-    def parse_all(main, positional=None):
-        for arguments in commands:
-            config_flags.parse([module, *arguments], copy.deepcopy(flags.FLAGS), positional)
-        parsed.append(module)
+    def parse_all(main, define_flags, positional=None):
+        def cli():
+            for arguments in commands:
+                define_flags(values := flags.FlagValues())
+                config_flags.parse([module, *arguments], values, positional)
+            parsed.append(module)
 
-    others, parsed = set(flags.FLAGS), []
-    monkeypatch.setattr(config_flags, "run", parse_all)
-    try:
-        runpy.run_module(module, run_name="__main__")
-    finally:
-        for name in set(flags.FLAGS) - others:
-            delattr(flags.FLAGS, name)
+        return cli
+
+    parsed = []
+    monkeypatch.setattr(config_flags, "program", parse_all)
+    runpy.run_module(module, run_name="__main__")
     assert parsed == [module]
 
 
@@ -105,7 +104,7 @@ def test_commands_parse(module, monkeypatch):
     folder = (ROOT / "experiments" / module).is_dir()
     spec = find_spec(f"experiments.{module}{'.__main__' if folder else ''}")
     source = Path(spec.origin).read_text(encoding="utf-8")
-    if "config_flags.run(" not in source:
+    if "config_flags.program(" not in source:
         pytest.skip("it has no flags")
     _parse(monkeypatch, f"experiments.{module}", _by_module()[module])
 

@@ -83,8 +83,7 @@ def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
         values = flags.FlagValues()
         evaluate.define_flags(values)
         config_flags.parse(["evaluate", str(run), "--final", *arguments], values, "run")
-        monkeypatch.setattr(evaluate, "FLAGS", values)
-        evaluate.main([])
+        evaluate.main(values)
 
     monkeypatch.setattr(loading, "make_agent", lambda *of, trained: agent_of(*of))
     play()

@@ -226,8 +226,7 @@ def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypa
     values = flags.FlagValues()
     evaluate.define_flags(values)
     config_flags.parse(["evaluate", f"--run={joint[0]}", "--games=1"], values)
-    monkeypatch.setattr(evaluate, "FLAGS", values)
-    evaluate.main([])
+    evaluate.main(values)
     assert asked == [(("eval", 1), {"seed": 0})]
     assert len(json.loads(capsys.readouterr().out)["returns"]) == 1
 

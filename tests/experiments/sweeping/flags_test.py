@@ -42,11 +42,10 @@ def test_command_lines_that_are_refused(tmp_path, arguments, says):
 
 
 @pytest.mark.parametrize("given", ["--presets=catch/joint", "--seeds=2", "--lr_rl=1e-3", "--dry_run"])
-def test_the_status_takes_nothing_that_would_plan_another_sweep(tmp_path, monkeypatch, given):
+def test_the_status_takes_nothing_that_would_plan_another_sweep(tmp_path, given):
     values, _ = _main(f"--out={tmp_path}", "--status", given)
-    monkeypatch.setattr(sweep, "FLAGS", values)
     with pytest.raises(ConfigError, match=f"^{given.partition('=')[0]}: --status tells of the sweep that is"):
-        sweep.main([])
+        sweep.main(values)
 
 
 @pytest.mark.parametrize("given", ["--lr_rl=1e-4,3e-4", "--mode=joint,rl_only"])
