@@ -199,15 +199,12 @@ def draw(arms: Sequence[Arm], key: str, notes: Sequence[str], path: Path, among:
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_multi_string(
-        "runs", None, "directories of runs, at least two curves; the name may be left out", flag_values=values
-    )
-    flags.DEFINE_string("key", collect.RETURN, "of metrics.jsonl, any with numbers", flag_values=values)
-    flags.DEFINE_string("out", "", "picture to write, which ends in .png", flag_values=values)
-    flags.DEFINE_boolean("overwrite", False, "replace the picture if there is one", flag_values=values)
-    flags.DEFINE_boolean(
-        "force", False, "compare runs of different games, or protocols of evaluation", flag_values=values
-    )
+    text, yes, _, texts = config_flags.kinds(values)
+    texts("runs", None, "directories of runs, at least two curves; the name may be left out")
+    text("key", collect.RETURN, "of metrics.jsonl, any with numbers")
+    text("out", "", "picture to write, which ends in .png")
+    yes("overwrite", False, "replace the picture if there is one")
+    yes("force", False, "compare runs of different games, or protocols of evaluation")
 
 
 def compare(values: flags.FlagValues) -> None:

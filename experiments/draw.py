@@ -32,10 +32,8 @@ def main(values: flags.FlagValues) -> None:
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_string("run", "", "run directory", flag_values=values)
-    flags.DEFINE_string(
-        "thesis", "", "FIGURE/ARM, a curve of the thesis to draw beside the run's", flag_values=values
-    )
+    flags.DEFINE_string("run", "", "run directory", values)
+    flags.DEFINE_string("thesis", "", "FIGURE/ARM, a curve of the thesis to draw beside the run's", values)
 
 
 cli = config_flags.program(main, define_flags, positional="run")

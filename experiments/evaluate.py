@@ -126,19 +126,18 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", flag_values=values)
+    flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", values)
     games = Info(int, "full games to play", minimum=1, maximum=1_000_000)
     config_flags.define("games", games, 10, values)
     envs = Info(int, "environments that play at once; 0: the run's eval_envs", "environments", minimum=0)
     config_flags.define("envs", envs, 0, values)
-    flags.DEFINE_boolean("final", False, "play the run's own final games, again", flag_values=values)
+    flags.DEFINE_boolean("final", False, "play the run's own final games, again", values)
     seed = Info(int, "of the games; the same seed gives the same games", minimum=0)
     config_flags.define("seed", seed, 0, values)
     epsilon = "probability of a random action; the run's eps_eval if not given"
     config_flags.define("epsilon", Info(float, epsilon, minimum=0, maximum=1), None, values)
     config_flags.define_import_flag(values)
-    gif = "file to write the first game to, as a GIF"
-    flags.DEFINE_string("gif", "", gif, flag_values=values)
+    flags.DEFINE_string("gif", "", "file to write the first game to, as a GIF", values)
     config_flags.define_runtime_flag(values)
 
 

@@ -36,10 +36,10 @@ def main(values: flags.FlagValues) -> None:
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
-    run = "run directory, one of its checkpoints, or an encoder that was kept"
-    flags.DEFINE_string("run", "", run, flag_values=values)
-    flags.DEFINE_string("encoder", "", "file to write, which ends in .npz", flag_values=values)
-    flags.DEFINE_boolean("overwrite", False, "replace the file if there is one", flag_values=values)
+    text, yes, *_ = config_flags.kinds(values)
+    text("run", "", "run directory, one of its checkpoints, or an encoder that was kept")
+    text("encoder", "", "file to write, which ends in .npz")
+    yes("overwrite", False, "replace the file if there is one")
     config_flags.define_import_flag(values)
 
 

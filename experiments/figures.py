@@ -231,37 +231,27 @@ def left_out_lines(numbers: Mapping[str, Any]) -> list[str]:
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
+    text, yes, names, *_ = config_flags.kinds(values)
     options.define_flags(values)
-    flags.DEFINE_string(
+    text(
         "figure",
         None,
         f"all; {', '.join(FIGURES)}, several with commas; {SCORES}, scores beside published ones; or a JSON "
         "file, see experiments/arms.py",
-        flag_values=values,
     )
-    flags.DEFINE_list(
-        "presets", ["atari100k/der"], f"the arms of --figure={SCORES}, may have *", flag_values=values
-    )
-    flags.DEFINE_list(
-        "games",
-        ["Pong"],
-        f"to run each arm on; {', '.join(envs.SUITES)} stand for suites of Atari games",
-        flag_values=values,
-    )
-    flags.DEFINE_string("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,", flag_values=values)
-    flags.DEFINE_string("out", "runs/figures", "directory of runs and figures", flag_values=values)
-    flags.DEFINE_string(
+    names("presets", ["atari100k/der"], f"the arms of --figure={SCORES}, may have *")
+    names("games", ["Pong"], f"to run each arm on; {', '.join(envs.SUITES)} stand for suites of Atari games")
+    text("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,")
+    text("out", "runs/figures", "directory of runs and figures")
+    text(
         "published",
         "Human,Dopamine Rainbow",
         "published results to draw as lines where a game has them, names with ; or commas, as in "
         f"srl_jax/data/published.csv; of --figure={SCORES} those of its presets, or names with ;, as in "
         "srl_jax/data/atari100k_methods.csv",
-        flag_values=values,
     )
-    flags.DEFINE_boolean("redraw", False, "draw from the runs that are there; start none", flag_values=values)
-    flags.DEFINE_boolean(
-        "force", False, "compare runs of different protocols, and say so in the figure", flag_values=values
-    )
+    yes("redraw", False, "draw from the runs that are there; start none")
+    yes("force", False, "compare runs of different protocols, and say so in the figure")
 
 
 def run(values: flags.FlagValues) -> int:

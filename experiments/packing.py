@@ -274,13 +274,11 @@ def _rows(path: Path, only_last: bool) -> dict[tuple[str, str, int], list[dict[s
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_string("runs", None, "directory in or below which the runs are", flag_values=values)
-    flags.DEFINE_string("out", None, "folder of the campaign; runs are added to it", flag_values=values)
-    flags.DEFINE_boolean(
-        "unpack", False, "make the directories of the runs that are packed in --runs", flag_values=values
-    )
-    text = "pack runs that were stopped, too, which nobody will resume"
-    flags.DEFINE_boolean("stopped", False, text, flag_values=values)
+    text, yes, *_ = config_flags.kinds(values)
+    text("runs", None, "directory in or below which the runs are")
+    text("out", None, "folder of the campaign; runs are added to it")
+    yes("unpack", False, "make the directories of the runs that are packed in --runs")
+    yes("stopped", False, "pack runs that were stopped, too, which nobody will resume")
 
 
 def main(values: flags.FlagValues) -> None:

@@ -144,6 +144,7 @@ def table(
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
+    text, yes, names, texts = config_flags.kinds(values)
     positive = Info(
         float, "true difference between the means of the two arms", unit="of the score", minimum=1e-9
     )
@@ -152,25 +153,11 @@ def define_flags(values: flags.FlagValues) -> None:
     config_flags.define("seeds", seeds, 5, values)
     power = Info(float, "how likely a difference is to be found", minimum=0.06, maximum=0.999)
     config_flags.define("power", power, 0.8, values)
-    flags.DEFINE_list(
-        "spread", [], "standard deviation over seeds, or one for each arm: 0.1,0.2", flag_values=values
-    )
-    flags.DEFINE_string(
-        "from", "", f"where spreads come from: a directory of runs, or {PUBLISHED}", flag_values=values
-    )
-    flags.DEFINE_string("game", None, "the game that counts; by default all of --from", flag_values=values)
-    flags.DEFINE_multi_string(
-        "arm",
-        [],
-        "of --from, given twice: the two that differ; by default each beside one like it",
-        flag_values=values,
-    )
-    flags.DEFINE_boolean(
-        "force",
-        False,
-        "of --from: take runs of different protocols of evaluation together",
-        flag_values=values,
-    )
+    names("spread", [], "standard deviation over seeds, or one for each arm: 0.1,0.2")
+    text("from", "", f"where spreads come from: a directory of runs, or {PUBLISHED}")
+    text("game", None, "the game that counts; by default all of --from")
+    texts("arm", [], "of --from, given twice: the two that differ; by default each beside one like it")
+    yes("force", False, "of --from: take runs of different protocols of evaluation together")
 
 
 def report(values: flags.FlagValues) -> list[str]:

@@ -157,13 +157,13 @@ def _chosen(flag: str, given: Sequence[str], valid: Sequence[str]) -> list[str]:
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
-    flags.DEFINE_list("games", ["Catch"], "to play", flag_values=values)
-    flags.DEFINE_list("policies", list(POLICIES), "to play them with", flag_values=values)
+    flags.DEFINE_list("games", ["Catch"], "to play", values)
+    flags.DEFINE_list("policies", list(POLICIES), "to play them with", values)
     episodes = Info(int, "full games of each policy on each game", "games", minimum=1, maximum=1_000_000)
     config_flags.define("episodes", episodes, 30, values)
     for name in (*PROTOCOL, "seed"):
         config_flags.define(name, INFOS[name], getattr(Config(), name), values)
-    flags.DEFINE_string("out", None, "CSV file to make, or to put the rows into", flag_values=values)
+    flags.DEFINE_string("out", None, "CSV file to make, or to put the rows into", values)
 
 
 def run(values: flags.FlagValues) -> int:

@@ -7,7 +7,6 @@ Several directories are compared with each other:
 `python -m experiments.report runs/a runs/b --out=report.html`.
 """
 
-import functools
 import importlib.util
 import math
 from pathlib import Path
@@ -26,8 +25,7 @@ NEEDED = {"jinja2": "Jinja2", "markdown_it": "markdown-it-py", "matplotlib": "ma
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
-    kinds = (flags.DEFINE_string, flags.DEFINE_boolean, flags.DEFINE_multi_string)
-    text, yes, texts = (functools.partial(kind, flag_values=values) for kind in kinds)
+    text, yes, _, texts = config_flags.kinds(values)
     texts("runs", None, "directory in or below which the runs are, or several; the name may be left out")
     text("out", None, "file to write, must end in .html; beside it goes a .csv")
     yes("overwrite", False, "replace the files if they are there")

@@ -29,21 +29,19 @@ from .sweeping.plan import Planned
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
+    text, yes, names, texts = config_flags.kinds(values)
     options.define_flags(values)
-    flags.DEFINE_list(
-        "presets", None, "what is compared: presets, or patterns as in thesis/*", flag_values=values
-    )
-    flags.DEFINE_multi_string(
+    names("presets", None, "what is compared: presets, or patterns as in thesis/*")
+    texts(
         "grid",
         None,
         "FLAG=VALUE,VALUE: each preset with each of these values, an arm each; repeated: with each "
         "combination; a ; separates values that have commas",
-        flag_values=values,
     )
-    flags.DEFINE_list("games", None, "to run each on; each preset's own if not given", flag_values=values)
-    flags.DEFINE_string("seeds", "1", "how many seeds, 5, or which ones: 0,3,7 or 3,", flag_values=values)
-    flags.DEFINE_string("out", None, "directory of the sweep, new or an old one's", flag_values=values)
-    flags.DEFINE_boolean("status", False, "print how far the sweep in --out is, and exit", flag_values=values)
+    names("games", None, "to run each on; each preset's own if not given")
+    text("seeds", "1", "how many seeds, 5, or which ones: 0,3,7 or 3,")
+    text("out", None, "directory of the sweep, new or an old one's")
+    yes("status", False, "print how far the sweep in --out is, and exit")
 
 
 def chosen_runs(values: flags.FlagValues, root: Path) -> list[Planned]:

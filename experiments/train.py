@@ -42,32 +42,29 @@ from .command_line.stopping import signals
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
+    text, yes, *_ = config_flags.kinds(values)
     config_flags.define_config_flags(values)
     config_flags.define_runtime_flag(values)
-    flags.DEFINE_string("out", None, "run directory to make; must be new or empty", flag_values=values)
-    flags.DEFINE_string(
+    text("out", None, "run directory to make; must be new or empty")
+    text(
         "seeds",
         None,
         "several seeds in this process, 0,1,2, instead of --seed: for an accelerator; a run directory each "
         "in --out, seed0, seed1, ...",
-        flag_values=values,
     )
     flags.DEFINE_enum(
         "resume",
         "off",
         ["off", "auto"],
         "auto: resume the run that --out holds from its newest good checkpoint, as if it had never stopped",
-        flag_values=values,
+        values,
     )
-    flags.DEFINE_boolean("overwrite", False, "delete the run that --out holds first", flag_values=values)
-    flags.DEFINE_boolean(
-        "print_config", False, "print the resolved config as JSON and exit", flag_values=values
-    )
-    flags.DEFINE_boolean(
+    yes("overwrite", False, "delete the run that --out holds first")
+    yes("print_config", False, "print the resolved config as JSON and exit")
+    yes(
         "dry_run",
         False,
         "check everything, print the resolved config as JSON, say where the run would be written, and exit",
-        flag_values=values,
     )
 
 

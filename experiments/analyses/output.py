@@ -14,7 +14,7 @@ from ..drawing import plots
 
 def define_out(files: str, values: flags.FlagValues) -> None:
     """Defines --out; `files` names what is written there."""
-    flags.DEFINE_string("out", "", f"directory for {files}", flag_values=values)
+    flags.DEFINE_string("out", "", f"directory for {files}", values)
 
 
 def place(given: str, *, drawn: bool) -> Path | None:

@@ -53,19 +53,12 @@ class CheckFailed(RuntimeError):
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
+    text, yes, names, *_ = config_flags.kinds(values)
     config_flags.define("rounds", Info(int, "how often each worker takes its turn", minimum=1), 7, values)
-    flags.DEFINE_list(
-        "only",
-        None,
-        f"rows to measure, of: {', '.join(MAIN)}; objectives for what each costs",
-        flag_values=values,
-    )
-    out = "directory for bench.json and bench.md; must be new or empty"
-    flags.DEFINE_string("out", None, out, flag_values=values)
-    other = "interpreter that has PyTorch and Tianshou"
-    flags.DEFINE_string("bench_python", PYTHON, other, flag_values=values)
-    quick = "one round of turns a twelfth as long, to try this program; its figures say nothing"
-    flags.DEFINE_boolean("quick", False, quick, flag_values=values)
+    names("only", None, f"rows to measure, of: {', '.join(MAIN)}; objectives for what each costs")
+    text("out", None, "directory for bench.json and bench.md; must be new or empty")
+    text("bench_python", PYTHON, "interpreter that has PyTorch and Tianshou")
+    yes("quick", False, "one round of turns a twelfth as long, to try this program; its figures say nothing")
 
 
 def chosen_rows(only: Sequence[str] | None) -> list[str]:

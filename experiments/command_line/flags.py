@@ -83,10 +83,23 @@ def define(
     if info.choices:
         text += f"; one of: {', '.join(info.choices)}"
     if info.kind is tuple:
-        flags.DEFINE_multi_string(name, list(default) or None, text, flag_values=values)
+        flags.DEFINE_multi_string(name, list(default) or None, text, values)
         return
     flag = flags.Flag(_Parser(info), _Serializer(), name, default, text, boolean=info.kind is bool)
     flags.DEFINE_flag(flag, values)
+
+
+def kinds(values: flags.FlagValues) -> tuple[Callable[..., Any], ...]:
+    """Four functions of (name, default, help) that define a flag.
+
+    Args:
+        values: where to define it.
+
+    Returns:
+        Those for a text, for yes or no, for texts with commas between them, and for texts of a repeated flag.
+    """
+    defining = (flags.DEFINE_string, flags.DEFINE_boolean, flags.DEFINE_list, flags.DEFINE_multi_string)
+    return tuple(functools.partial(define, flag_values=values) for define in defining)
 
 
 def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
@@ -97,7 +110,7 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
         "preset",
         None,
         "named settings; flags beside it override them, pieces behind + change them: thesis/joint_256+small",
-        flag_values=values,
+        values,
     )
     told = "how games are played and what is reported, over --preset or --config; flags beside it override it"
     define("protocol", Info(str, told, choices=tuple(PROTOCOLS)), None, values)
@@ -105,7 +118,7 @@ def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
         "config",
         None,
         "config.json of a run, or the run's directory: its settings, which flags beside it override",
-        flag_values=values,
+        values,
     )
 
 
@@ -118,7 +131,7 @@ def define_runtime_flag(values: flags.FlagValues = flags.FLAGS) -> None:
 def define_import_flag(values: flags.FlagValues = flags.FLAGS) -> None:
     """Defines --import of programs that read a run; None where it was not given."""
     help_text = "what to import in place of what the run's config.json names; may be repeated"
-    flags.DEFINE_multi_string("import", None, help_text, flag_values=values)
+    flags.DEFINE_multi_string("import", None, help_text, values)
 
 
 def _base(values: flags.FlagValues, game: str | None) -> tuple[dict[str, Any], str]:

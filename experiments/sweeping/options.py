@@ -25,23 +25,19 @@ _COUNTS = {
 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines the flags of training that a sweep gives to its runs, and those that say how runs are run."""
+    text, yes, *_ = config_flags.kinds(values)
     config_flags.define_config_flags(values)
     config_flags.define_runtime_flag(values)
-    flags.DEFINE_enum(
-        "launcher", "local", ["local", "ray"], "who runs the runs: this machine, or a Ray cluster",
-        flag_values=values,
-    )  # fmt: skip
+    launchers = "who runs the runs: this machine, or a Ray cluster"
+    flags.DEFINE_enum("launcher", "local", ["local", "ray"], launchers, values)
     for name, (info, default) in _COUNTS.items():
         config_flags.define(name, info, default, values)
-    flags.DEFINE_string(
+    text(
         "ray_address",
         None,
         "of a Ray cluster that runs, HOST:PORT or auto; a new one on this machine if not given",
-        flag_values=values,
     )
-    flags.DEFINE_boolean(
-        "dry_run", False, "print what would run and how long it would take, and exit", flag_values=values
-    )
+    yes("dry_run", False, "print what would run and how long it would take, and exit")
 
 
 def launcher_options(values: flags.FlagValues) -> dict[str, Any]:
