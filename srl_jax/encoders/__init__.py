@@ -1,9 +1,9 @@
 """The encoders: `REGISTRY[name](observation_shape, **options) -> Encoder`, a row each.
 
-`observation_shape` is (H, W, S * C), of any size from the least that the layers fit. Each comes with the
-decoder that mirrors it, and all have the option `features` and those of `srl_jax.encoders.options.Start` and
-`End`. `flax_encoder` makes an encoder of any flax module. `from_npz` loads one that `srl-jax export` has
-written.
+`observation_shape` is (H, W, S * C), of any size from the least that the layers fit. A ValueError says that
+it is smaller, or that an option is out of range. Each row comes with the decoder that mirrors it, and all
+have the option `features` and those of `srl_jax.encoders.options.Start` and `End`. `flax_encoder` makes an
+encoder of any flax module. `from_npz` loads one that `srl-jax export` has written.
 """
 
 from srl_jax.encoders.adapter import flax_encoder
@@ -39,9 +39,6 @@ def nature(
         features: size of a linear layer; 0 for none.
         padding: "valid"; or "same", zeros around every layer's input, 7,744 features at 84 x 84: what
             Dopamine's JAX agents and those built on it run, flax's default.
-
-    Raises:
-        ValueError: where an option is out of range or the frames are too small.
     """
     layers = [Layer(32, 8, 4), Layer(64, 4, 2), Layer(64, 3, 1)]
     return convolutional_encoder(
@@ -58,9 +55,6 @@ def der(observation_shape: tuple[int, int, int], start: Start, end: End, *, feat
 
     Args:
         features: size of a linear layer; 0 for none.
-
-    Raises:
-        ValueError: where an option is out of range or the frames are too small.
     """
     layers = [Layer(32, 5, 5), Layer(64, 5, 5)]
     return convolutional_encoder(observation_shape, layers, start, end, features=features, least_seen=75 / 84)
@@ -92,9 +86,6 @@ def a_lix(
         lix: the radius S, in pixels of the maps, that mixing starts with, 1 in the paper; 0 leaves the LIX
             layers out.
         lix_goal: the discontinuity of the gradient that S is tuned to; 0 lets S stay as it is.
-
-    Raises:
-        ValueError: where an option is out of range or the frames are too small.
     """
     if lix > MOST:
         raise ValueError(f"lix must be at most {MOST:g}")
@@ -113,9 +104,6 @@ def mrq(observation_shape: tuple[int, int, int], start: Start, end: End, *, feat
     Args:
         features: size of the linear layer, behind which the default end is LayerNorm and ELU; 0 leaves it
             out. The authors' LayerNorm has no scale and no bias to learn.
-
-    Raises:
-        ValueError: where an option is out of range or the frames are too small.
     """
     layers = [Layer(32, 3, 2), Layer(32, 3, 2), Layer(32, 3, 2), Layer(32, 3, 1)]
     return convolutional_encoder(
@@ -139,9 +127,6 @@ def sac_ae(
     Args:
         features: size of the bottleneck; the thesis has 50 and 256. 0 leaves it out.
         layer_norm: LayerNorm before the tanh of the default end (in the thesis' code, not in its text).
-
-    Raises:
-        ValueError: where an option is out of range or the frames are too small.
     """
     layers = [Layer(32, 3, 2), Layer(32, 3, 1), Layer(32, 3, 1), Layer(32, 3, 1)]
     own_end = "layer_norm_tanh" if layer_norm else "tanh"
@@ -155,9 +140,6 @@ def tiny(observation_shape: tuple[int, int, int], start: Start, end: End, *, fea
     Args:
         features: size of the bottleneck, behind which the default end is LayerNorm and tanh; 0 leaves it out,
             as `nature` does.
-
-    Raises:
-        ValueError: where an option is out of range or the frames are too small.
     """
     layers = [Layer(16, 6, 4), Layer(16, 4, 2)]
     own_end = "layer_norm_tanh"

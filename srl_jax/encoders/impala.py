@@ -126,9 +126,6 @@ def impala(
     Args:
         features: size of the linear layer, behind which the default end is ReLU; 0 leaves it out.
         width: factor of the paper's 16, 32 and 32 channels.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("width", width)
     rows, columns, depth = observation_shape

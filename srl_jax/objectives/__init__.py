@@ -1,6 +1,7 @@
 """The representation objectives: `REGISTRY[name](context, **options) -> Objective`; a row each.
 
-`register` adds one of your own, see `srl_jax.plugins`.
+Each raises a ValueError where an option is out of range. `register` adds one of your own, see
+`srl_jax.plugins`.
 """
 
 from srl_jax.objectives.bisimulation import bisimulation

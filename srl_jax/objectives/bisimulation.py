@@ -42,9 +42,6 @@ def bisimulation(context: Context, *, weight: float = 1.0, discount: float = 0.9
 
     Args:
         discount: the factor of the distance of the next latents, in [0, 1).
-
-    Raises:
-        ValueError: discount is out of range.
     """
     if not 0 <= discount < 1:
         raise ValueError("discount must be at least 0 and below 1")

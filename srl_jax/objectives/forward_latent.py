@@ -64,9 +64,6 @@ def forward_latent(
             collapse.
         tau: of the slow copy, see `srl_jax.learning.update.ema`.
         every: k of the periodic one, in updates.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("steps", steps)
     check_size("hidden", hidden, least=0)

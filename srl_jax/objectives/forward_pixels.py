@@ -51,9 +51,6 @@ def forward_pixels(
             the same grey wherever nothing moves.
         action: "joined" to the latent as one-hot vectors (the thesis' code appends its number), or
             "multiplied" with it, see `ActionGate`.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("steps", steps)
     check_choice("target", target, TARGETS)

@@ -48,9 +48,6 @@ def infonce(
         temperature: what similarities are divided by.
         view: see `srl_jax.augment.make_view`.
         tau: of the slow copies, see `srl_jax.learning.update.ema`.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("temporal", temporal, least=0)
     check_size("hidden", hidden, least=0)

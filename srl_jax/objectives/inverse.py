@@ -37,9 +37,6 @@ def inverse(context: Context, *, weight: float = 1.0, hidden: int = 256, steps: 
     Args:
         hidden: width of the head's hidden layer.
         steps: how many steps apart the latents are; rows whose episode ends between them count 0.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("hidden", hidden)
     check_size("steps", steps)

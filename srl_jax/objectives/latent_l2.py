@@ -43,9 +43,6 @@ def latent_l2(
         target: "zero", or "slow", the latent of a slow copy of the encoder: against its drift (thesis,
             section 6.4).
         tau: of the slow copy, see `srl_jax.learning.update.ema`.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_choice("norm", norm, NORMS)
     check_choice("target", target, TARGETS)

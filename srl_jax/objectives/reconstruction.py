@@ -131,8 +131,7 @@ def reconstruction(
             `decoder_scale` then has no effect, and decoder weight decay is of the rest of the decoder.
 
     Raises:
-        ValueError: where an option is out of range, or the encoder has no decoder, or with `tied` none whose
-            convolutions mirror its own.
+        ValueError: where the encoder has no decoder, or with `tied` none whose convolutions mirror its own.
     """
     if not 0 <= masked < 1:
         raise ValueError("masked must be at least 0 and below 1")

@@ -50,9 +50,6 @@ def reward(context: Context, *, weight: float = 1.0, hidden: int = 256, loss: st
         hidden: width of the head's hidden layer; 0 for a linear head.
         loss: "two_hot", the cross-entropy over 65 bins of symlog in [-10, 10], or "squared", in units of
             reward squared.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("hidden", hidden, least=0)
     check_choice("loss", loss, REWARD_LOSSES)
@@ -82,9 +79,6 @@ def terminal(
     Args:
         hidden: width of the head's hidden layer; 0 for a linear head.
         loss: "cross_entropy" of a logit, or "squared" of the output itself, as in MR.Q.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("hidden", hidden, least=0)
     check_choice("loss", loss, TERMINAL_LOSSES)

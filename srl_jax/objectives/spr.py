@@ -73,8 +73,7 @@ def spr(
         importance: whether the loss is multiplied by replay's importance weights, as in the authors' code.
 
     Raises:
-        ValueError: where an option is out of range, or with `projection=rl` RL's head is not trained or has
-            no such layer.
+        ValueError: with `projection=rl`, where RL's head is not trained or has no such layer.
     """
     check_size("steps", steps)
     check_size("hidden", hidden)

@@ -42,9 +42,6 @@ def byol(
         outputs: size of a projection.
         view: see `srl_jax.augment.make_view`.
         tau: of the slow copies, see `srl_jax.learning.update.ema`.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("hidden", hidden)
     check_size("outputs", outputs)
@@ -104,9 +101,6 @@ def vicreg(
         hidden, outputs: width of the expander's hidden layer and size of what it gives.
         invariance, variance, covariance: factors of the three terms: lambda, mu and nu.
         view: see `srl_jax.augment.make_view`.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("hidden", hidden, least=0)
     check_size("outputs", outputs)
@@ -150,9 +144,6 @@ def barlow(
         hidden, outputs: width of the projection's hidden layer and size of what it gives.
         redundancy: lambda.
         view: see `srl_jax.augment.make_view`.
-
-    Raises:
-        ValueError: where an option is out of range.
     """
     check_size("hidden", hidden, least=0)
     check_size("outputs", outputs)
