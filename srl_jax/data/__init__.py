@@ -1,4 +1,7 @@
-"""What others measured, to draw beside your own, and where Atari games keep positions in memory."""
+"""What others measured, to draw beside your own, and where Atari games keep positions in memory.
+
+README.md beside this file says what each column of the tables means, and its unit.
+"""
 
 import csv
 import functools
@@ -14,20 +17,9 @@ from srl_jax import envs
 
 
 class Published(NamedTuple):
-    """A published score of one method in one game; None: not known here.
+    """A published score of one method in one game, a row of published.csv, whose columns README.md explains.
 
-    Attributes:
-        game: the Atari game.
-        method: its name.
-        env_steps: agent decisions, 4 emulator frames each, that it learned from; None for Random and Human.
-        score: raw, the mean over seeds.
-        spread: standard deviation over seeds, or what the source gives after a plus-minus.
-        seeds: runs that the score is the mean of.
-        score_of: "training", "evaluation", or "best evaluation": the highest one of the run.
-        sticky_actions: probability.
-        epsilon: of the policy whose score it is.
-        protocol: what else there is to say.
-        source: paper and table, or repository and file.
+    None: not known here; as env_steps, of Random and Human, who do not learn.
     """
 
     game: str
@@ -48,19 +40,10 @@ POLICIES = ("random", "no-op")
 
 
 class ReferencePolicy(NamedTuple):
-    """What a policy that learns nothing scores in whole games; None: not known here, or the game has none.
+    """What a policy that learns nothing scores: a row of reference_policies.csv, see README.md.
 
-    Attributes:
-        game: its canonical name, as config.json has it.
-        policy: one of `POLICIES`.
-        return_mean: raw score, the mean over games.
-        return_std: standard deviation over games (n - 1).
-        episodes: games that were played.
-        length_mean: of a game, env steps.
-        sticky_actions: probability.
-        noop_max: random no-ops at the start of a game are fewer than this.
-        eval_max_steps: env steps after which a game was cut.
-        source: the command that plays these games again, or where the number was published.
+    None: not known here, or the game has none. `source` is the command that plays these games again, or where
+    the number was published.
     """
 
     game: str
@@ -157,22 +140,9 @@ def with_reference_scores(games: Iterable[str]) -> list[str]:
 
 
 class Method100k(NamedTuple):
-    """A method whose scores after 100,000 env steps were published, and what these are; None: not known here.
+    """A method with scores after 100,000 env steps, a row of atari100k_methods.csv, see README.md.
 
-    Attributes:
-        method: its name.
-        basis: "as reported" by its paper, "rerun by Agarwal et al. 2021", or "own runs", which its authors
-            released.
-        level: "runs" where the scores of single runs were released, whose mean and standard deviation these
-            are; "means of games" where the games' means alone are known, so that an interquartile mean of
-            runs is not.
-        runs: of each game, as "100" or "14 to 16".
-        iqm_of_runs: interquartile mean of human-normalised scores of all runs of the 26 games, computed from
-            the released runs with `srl_jax.statistics.interquartile_mean`.
-        sticky_actions: probability.
-        epsilon: of the policy whose scores they are.
-        protocol: what else there is to say.
-        source: repository, revision and file.
+    None: not known here.
     """
 
     method: str
