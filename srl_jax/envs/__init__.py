@@ -25,23 +25,9 @@ from srl_jax.envs.games import game as _game
 from srl_jax.errors import ConfigError
 
 __all__ = [
-    "ATARI_57",
-    "FRAME_SKIP",
-    "MAX_FRAMES",
-    "NAMES",
-    "REGISTRY",
-    "SUITES",
-    "Game",
-    "adapted",
-    "canonical",
-    "file_name",
-    "game",
-    "known",
-    "label",
-    "make",
-    "register",
-    "several",
-]
+    "ATARI_57", "FRAME_SKIP", "MAX_FRAMES", "NAMES", "REGISTRY", "SUITES", "Game", "adapted",
+    "canonical", "file_name", "game", "known", "label", "make", "register", "several",
+]  # fmt: skip
 
 
 def make(
