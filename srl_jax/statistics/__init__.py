@@ -12,29 +12,11 @@ games, and for interquartile means of few runs; for all else percentile interval
 which draws runs again within each game. An `Interval` says which it is. A single run has none: its limits are
 NaN.
 
-With few runs the bootstrap is too narrow. Of intervals at 95 %, this share contains the truth, in percent
-(`python -m experiments.analyses.coverage`: up to 10,000 simulated experiments each; Atari: distributions like
-those of DER's 100 published runs; Catch: residuals of 185 runs; "two kinds": runs of which 30 % learn the
-game and the others do not; experiments/results/coverage has the table):
-
-    runs of each game                               2    3    5    7   10   20
-    Catch, mean, bootstrap                         49   74   84   87   89   92
-    Catch, mean, Student's t                       95   95   95   95   95   95
-    Catch, difference, bootstrap                   66   80   88   90   91   93
-    Catch, difference, Welch's t                   98   97   95   96   95   95
-    Atari, mean of a game, bootstrap               47   69   80   84   88   91
-    Atari, mean of a game, Student's t             93   91   90   91   92   94
-    Atari, difference on a game, bootstrap         66   80   88   89   91   93
-    Atari, difference on a game, Welch's t         97   97   96   96   95   95
-    Atari, DER less SPR on a game, Welch's t       95   94   93   93   93   94
-    Atari, IQM of 26 games, bootstrap              82   86   90   93   93   96
-    Atari, IQM of 26 games, stratified t           97   96   95   96   95   96
-    two kinds, mean of one game, Student's t       82   71   83   91   94   94
-    two kinds, difference on a game, Welch's t     93   98   98   96   96   95
-
-That Welch's interval leaves out 0 is therefore a two-sided test at about 5 %, at worst at 7 %, from 3 runs on
-and nearly so from 2. That a bootstrap interval does is none with few runs: its kind says so below `ENOUGH` of
-them. Where runs are of two kinds, no interval of the mean of 2 to 5 of them holds what it says, nor does
+With few runs the bootstrap is too narrow. docs/figures.md has which share of intervals at 95 % contains the
+truth, and experiments/results/coverage/README.md has it of more sources of returns. That Welch's interval
+leaves out 0 is a two-sided test at about 5 %, at worst at 7 %, from 3 runs on and nearly so from 2. That a
+bootstrap interval does is none with few runs: its kind says so below `ENOUGH` of them. Where runs are of two
+kinds, some of which learn the game, no interval of the mean of 2 to 5 of them holds what it says, nor does
 Welch's of a difference from an arm that has one kind.
 `welch_power`, `smallest_effect` and `runs_needed` say how many runs a difference takes.
 """

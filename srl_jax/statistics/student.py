@@ -1,7 +1,7 @@
 """Intervals of means from few runs: Student's t for one arm, Welch's t for the difference of two.
 
 Both are exact, or nearly so, where returns are normal, from two runs on: they pay for the spread that is not
-known with a width that grows as runs get fewer. `srl_jax/statistics/__init__.py` has what they cover.
+known with a width that grows as runs get fewer. experiments/results/coverage has what they cover.
 """
 
 import math
