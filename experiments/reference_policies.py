@@ -14,8 +14,6 @@ import contextlib
 import csv
 import functools
 import io
-import os
-import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -26,8 +24,9 @@ from absl import flags
 from srl_jax import envs
 from srl_jax.config import INFOS, Config
 from srl_jax.data import POLICIES, ReferencePolicy, policies_from
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files.display import Progress
+from srl_jax.files.reading import replace_text
 from srl_jax.specs import Info, choices_text, value_text
 
 from .command_line import flags as config_flags
@@ -126,13 +125,8 @@ def update(path: Path, row: ReferencePolicy) -> None:
     """
     rows = {(old.game, old.policy): old for old in _read(path)} | {(row.game, row.policy): row}
     ordered = sorted(rows.values(), key=lambda row: (row.game, POLICIES.index(row.policy)))
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(table(ordered), encoding="utf-8")
-        os.replace(partial, path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise SaveError(f"--out={path}: {error.strerror}") from error
+    with saving(f"--out={path}"):
+        replace_text(path, table(ordered))
 
 
 def _read(path: Path) -> list[ReferencePolicy]:
@@ -189,9 +183,9 @@ def run(values: flags.FlagValues) -> int:
     for config in configs:
         check_extras(config)
     if out is not None:
-        out = _check_out(out)
-    writer = csv.writer(sys.stdout, lineterminator="\n")
-    writer.writerow(ReferencePolicy._fields)
+        out = paths.check_file("out", out, ".csv", overwrite=True)
+        _read(out)
+    print(table([]), end="")
     with signals() as caught:
         for config in configs:
             for policy in policies:
@@ -202,17 +196,6 @@ def run(values: flags.FlagValues) -> int:
                 if out is not None:
                     update(out, row)
     return 0
-
-
-def _check_out(text: str) -> Path:
-    paths.check_name("out", text)
-    path = Path(os.path.expanduser(text))
-    if path.suffix.lower() != ".csv":
-        raise ConfigError(f"--out={text}: must end in .csv")
-    if not path.absolute().parent.is_dir():
-        raise ConfigError(f"--out={text}: no such directory")
-    _read(path)
-    return path
 
 
 cli = config_flags.program(run, define_flags)

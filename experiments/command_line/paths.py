@@ -78,7 +78,9 @@ def _checked(flag: str, text: str, problem: Callable[[Path], str]) -> Path:
     Raises:
         ConfigError: there is one, or its name cannot be shown, or the system refuses it.
     """
-    check_name(flag, text)
+    odd = next((character for character in text if not character.isprintable()), None)
+    if odd is not None:
+        raise ConfigError(f"--{flag}={text}: has the character {odd!a}; name it with printable ones")
     path = Path(os.path.expanduser(text))
     try:
         found = problem(path)
@@ -87,18 +89,3 @@ def _checked(flag: str, text: str, problem: Callable[[Path], str]) -> Path:
     if found:
         raise ConfigError(f"--{flag}={text}: {found}")
     return path
-
-
-def check_name(flag: str, text: str) -> None:
-    """Whether a path that is to be written to can be shown in a line.
-
-    Args:
-        flag: that it came from.
-        text: its value.
-
-    Raises:
-        ConfigError: it has a line break, another control character, or bytes that are no text.
-    """
-    odd = next((character for character in text if not character.isprintable()), None)
-    if odd is not None:
-        raise ConfigError(f"--{flag}={text}: has the character {odd!a}; name it with printable ones")

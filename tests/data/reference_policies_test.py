@@ -148,7 +148,7 @@ def test_a_game_without_an_action_that_does_nothing(tmp_path, capsys):
         (["--out=FOLDER/x.txt"], "--out=FOLDER/x.txt: must end in .csv"),
         (["--out=FOLDER/no/x.csv"], "--out=FOLDER/no/x.csv: no such directory"),
         (["--out=FOLDER/other.csv"], "--out=FOLDER/other.csv: no table of this command"),
-        (["--out=FOLDER/folder.csv"], "--out=FOLDER/folder.csv: Is a directory"),
+        (["--out=FOLDER/folder.csv"], "--out=FOLDER/folder.csv: exists and is not a file"),
     ],
 )
 def test_bad_input_is_refused_and_nothing_written(tmp_path, capsys, arguments, told):
