@@ -4,7 +4,7 @@ import dataclasses
 import itertools
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import contextmanager
 from functools import cache, partial
 from pathlib import Path
@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from srl_jax.config import Config
+from srl_jax.config import INFOS, Config
 from srl_jax.files import checkpoint
 from srl_jax.learning.agent import Agent, Seeds, make_agent, over_seeds
 from srl_jax.run import ending
@@ -331,3 +331,18 @@ def loss_of(objective: Objective, latents: Latents, window: Window, *, seed: int
     """The losses of a head of random numbers, that head, and its slow copy, which is another one."""
     head, slow = (random_params(objective.init, seed + i) for i in range(2))
     return np.asarray(objective.loss(head, slow, latents, window, jax.random.key(key))[0]), head, slow
+
+
+def last_of_each(arguments: Iterable[str]) -> tuple[str, ...]:
+    """A command line less each flag that a later one of its name replaces; --objective may be repeated.
+
+    For tests that add flags to others: a program refuses one that is given twice.
+    """
+    arguments = tuple(arguments)
+    names = [text.partition("=")[0] for text in arguments]
+    repeated = {f"--{info.flag or name}" for name, info in INFOS.items() if info.kind is tuple}
+    return tuple(
+        text
+        for i, (name, text) in enumerate(zip(names, arguments, strict=True))
+        if name in repeated or not name.startswith("--") or name not in names[i + 1 :]
+    )

@@ -20,7 +20,7 @@ from srl_jax.files.checkpoint import read_manifest
 from srl_jax.files.metrics import read_metrics
 from srl_jax.plugins import Registry, load, located
 from srl_jax.specs import parse
-from tests.helpers import SMALL, write_run
+from tests.helpers import SMALL, last_of_each, write_run
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 ROOT = pathlib.Path(__file__).resolve().parents[1]
@@ -290,7 +290,7 @@ def test_a_sweep_gives_its_runs_what_they_import(tmp_path):
     flags = [flag for flag in FLAGS if not flag.startswith("--game=")]
     line = [sys.executable, "-m", "experiments.sweep", "--presets=catch/joint", "--import=mine.py"]
     done = subprocess.run(
-        [*config_flags.last_of_each((*line, *flags, "--steps=8")), "--out=runs", "--games=Catch"],
+        [*last_of_each((*line, *flags, "--steps=8")), "--out=runs", "--games=Catch"],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         capture_output=True,

@@ -342,21 +342,6 @@ def parse(
     return rest
 
 
-def last_of_each(arguments: Iterable[str]) -> tuple[str, ...]:
-    """A command line less each flag that a later one of its name replaces; --objective may be repeated.
-
-    For programs that add flags to others: `parse` refuses one that is given twice.
-    """
-    arguments = tuple(arguments)
-    names = [text.partition("=")[0] for text in arguments]
-    repeated = {f"--{info.flag or name}" for name, info in INFOS.items() if info.kind is tuple}
-    return tuple(
-        text
-        for i, (name, text) in enumerate(zip(names, arguments, strict=True))
-        if name in repeated or not name.startswith("--") or name not in names[i + 1 :]
-    )
-
-
 def guarded(main: Callable[[list[str]], Any]) -> Callable[[list[str]], Any]:
     """The function, ending the process with a line and a status where it raises what `srl_jax.errors` has."""
 

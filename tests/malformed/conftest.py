@@ -12,8 +12,7 @@ from absl import flags
 
 from experiments import draw, evaluate, train
 from experiments.command_line import flags as config_flags
-from experiments.command_line.flags import last_of_each
-from tests.helpers import SMALL, write_checkpoint, write_run
+from tests.helpers import SMALL, last_of_each, write_checkpoint, write_run
 
 LIMIT_S = 20
 """A case that takes longer has failed; what waits for a pipe waits for ever."""

@@ -20,6 +20,7 @@ from srl_jax.config import Config
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.files.provenance import git_revision
+from tests.helpers import last_of_each
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -108,7 +109,7 @@ def train_here(*arguments):
     """`experiments.train` in this process; returns its status, raises what it raises."""
     values = flags.FlagValues()
     train.define_flags(values)
-    config_flags.parse(["train", *config_flags.last_of_each(arguments)], values)
+    config_flags.parse(["train", *last_of_each(arguments)], values)
     return train.train(values)
 
 

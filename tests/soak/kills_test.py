@@ -17,7 +17,7 @@ from pathlib import Path
 
 import pytest
 
-from experiments.command_line.flags import last_of_each
+from tests.helpers import last_of_each
 from tests.soak.conftest import ROOT, different, remains
 
 SMALL = (

@@ -196,12 +196,6 @@ def test_bad_input_is_one_line_and_status_2(arguments, flag, choice, tmp_path, c
     assert loop.calls == []
 
 
-def test_a_later_flag_of_a_name_replaces_an_earlier_one():
-    given = ("--a=1", "--objective=x", "--b=2", "--c", "--objective=y", "--a=3", "--b=", "run")
-    left = ("--objective=x", "--c", "--objective=y", "--a=3", "--b=", "run")
-    assert config_flags.last_of_each(given) == left
-
-
 @pytest.mark.parametrize(
     ("program", "flag", "hint"),
     [
