@@ -31,7 +31,7 @@ from srl_jax.run.ending import Ending
 
 from .command_line import flags as config_flags
 from .command_line import paths
-from .runs.run_data import RunData, check_rows, in_order, load_run, run_directories, runs_below
+from .runs.run_data import RunData, check_rows, in_order, load_run, run_directories
 
 CONFIGS = "configs.json"
 """[{"arm": its name, "config": the fields that its runs on a game share, "runs": [{"path": below the folder,
@@ -47,15 +47,6 @@ OWN = ("seed", "started", "continued")
 def is_packed(folder: Path) -> bool:
     """Whether runs are packed in this folder."""
     return (folder / CONFIGS).is_file()
-
-
-def folders_below(root: Path) -> list[Path]:
-    """The folders with packed runs in or below a directory.
-
-    Raises:
-        ConfigError: a directory cannot be read.
-    """
-    return runs_below(root, CONFIGS)
 
 
 def read(folder: Path, *, only_last: bool = False, mend: bool = False) -> list[RunData]:

@@ -28,11 +28,11 @@ from srl_jax.errors import ConfigError, saving
 from srl_jax.files.display import Progress
 from srl_jax.files.reading import replace_text
 from srl_jax.specs import Info, choices_text, value_text
+from srl_jax.training import check_game
 
 from .command_line import flags as config_flags
 from .command_line import paths
 from .command_line.stopping import signals
-from .train import check_extras
 
 MOST_ENVS = 100
 """Games that are played side by side."""
@@ -181,7 +181,7 @@ def run(values: flags.FlagValues) -> int:
     given: Mapping[str, Any] = {name: values[name].value for name in (*PROTOCOL, "seed")}
     configs = [Config(game=game, **given) for game in games]
     for config in configs:
-        check_extras(config)
+        check_game(config)
     if out is not None:
         out = paths.check_file("out", out, ".csv", overwrite=True)
         _read(out)

@@ -157,15 +157,6 @@ def check_seeds(values: flags.FlagValues) -> list[int]:
     return seeds
 
 
-def check_extras(config: Config) -> None:
-    """Whether the run's environments can be made here, and the optional packages that it needs are installed.
-
-    Raises:
-        ConfigError: they cannot; the line says why, or which extra has the package.
-    """
-    check_game(config)
-
-
 def say_unused(values: flags.FlagValues, game: str) -> None:
     """A line for each flag that was given and that the game's environments have no use for."""
     row = envs.game(game)
@@ -217,7 +208,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     overwrite = values["overwrite"].value
     path = check_out(values["out"].value, config, overwrite=overwrite, resume=resume, seeds=seeds)
     fresh = not resume or blank(path)  # whatever lies there makes way
-    check_extras(config)
+    check_game(config)
     if not resume:
         check_paths(config)
     dry = values["dry_run"].value

@@ -19,7 +19,7 @@ from srl_jax.files import display, provenance
 from srl_jax.learning.modes import MODES
 
 from .. import packing
-from .run_data import RunData, arm_name, in_order, load_run, run_directories
+from .run_data import RunData, arm_name, in_order, load_run, run_directories, runs_below
 
 RETURN = "eval/return_mean"
 """The key of learning curves."""
@@ -70,7 +70,7 @@ def load_runs(*roots: str | Path) -> list[RunData]:
     files: dict[str, Path] = {}
     for root in map(Path, roots):
         found = [path / "config.json" for path in run_directories(root)]
-        found += [folder / packing.CONFIGS for folder in packing.folders_below(root)]
+        found += [folder / packing.CONFIGS for folder in runs_below(root, packing.CONFIGS)]
         if not found:
             raise ConfigError(f"{root}: no run directory there (none has a config.json), and no packed run")
         for path in found:
@@ -117,7 +117,7 @@ def _each_once(runs: Sequence[RunData]) -> Sequence[RunData]:
 def arm_names(root: Path) -> list[str]:
     """The arms of all runs in or below a directory, whose rows are not read."""
     names = {arm_name(path) for path in run_directories(root)}
-    return sorted(names.union(*(packing.arms(folder) for folder in packing.folders_below(root))))
+    return sorted(names.union(*(packing.arms(folder) for folder in runs_below(root, packing.CONFIGS))))
 
 
 def grouped(runs: Iterable[RunData]) -> dict[str, dict[str, list[RunData]]]:

@@ -3,7 +3,7 @@
 import dataclasses
 import json
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -86,7 +86,6 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
         import jax
 
         jax.config.update("jax_platforms", "cpu")
-    from ..train import check_extras
 
     everywhere = set.intersection(*(set(run.flags.items()) for run in runs)) if runs else set()
     without: dict[str, list[ConfigError]] = {}
@@ -95,7 +94,7 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
     for run in runs:
         while run.name not in entries:
             try:
-                entries[run.name] = Entry(run, _config(run, known, check_extras))
+                entries[run.name] = Entry(run, _config(run, known))
             except Unread as error:
                 flag = INFOS[error.field].flag or error.field
                 without.setdefault(flag, []).append(ConfigError(f"{run.name}: {error}"))
@@ -109,14 +108,14 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
     return entries
 
 
-def _config(run: Planned, known: dict[Any, Config], check: Callable[[Config], None]) -> Config:
+def _config(run: Planned, known: dict[Any, Config]) -> Config:
     """A run's configuration, resolved; `known` has those of the runs before it, but for the seed."""
-    from srl_jax.training import resolved
+    from srl_jax.training import check_game, resolved
 
     config, given = parsed(run)
     key = dataclasses.replace(config, seed=0), frozenset(given)
     if key not in known:
-        check(config)
+        check_game(config)
         known[key] = resolved(*key)
     return dataclasses.replace(known[key], seed=config.seed)
 

@@ -22,7 +22,7 @@ from srl_jax.files.display import hms
 
 from .. import packing
 from ..runs import collect
-from ..runs.collect import RunData
+from ..runs.run_data import RunData, runs_below
 from . import states
 from .manifest import Entry
 
@@ -129,7 +129,7 @@ def _published() -> Sums:
     from srl_jax.training import completed
 
     runs: list[RunData] = []
-    for folder in packing.folders_below(RESULTS):
+    for folder in runs_below(RESULTS, packing.CONFIGS):
         with contextlib.suppress(ConfigError):  # of an earlier version
             runs += packing.read(folder, only_last=True)
     found = []
