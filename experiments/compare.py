@@ -16,7 +16,7 @@ from absl import flags
 
 from srl_jax import specs, statistics
 from srl_jax.config import INFOS, Config
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display
 from srl_jax.files.metrics import LEADING
 
@@ -226,11 +226,9 @@ def compare(values: flags.FlagValues) -> None:
     for note in notes:
         display.say(note)
     if path:
-        try:
-            among = {name for root in roots for name in collect.arm_names(root)}
+        among = {name for root in roots for name in collect.arm_names(root)}
+        with saving(f"--out={out}"):
             draw(arms, key, notes, path, among)
-        except OSError as error:
-            raise SaveError(f"--out={out}: {error.strerror}") from error
     display.result(text)
 
 

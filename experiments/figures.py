@@ -25,7 +25,7 @@ from absl import flags
 from srl_jax import envs, statistics
 from srl_jax.config import Config
 from srl_jax.data import atari100k_methods, published, reference_policies
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display
 from srl_jax.files.reading import replace_text
 from srl_jax.specs import choices_text
@@ -304,7 +304,7 @@ def run(values: flags.FlagValues) -> int:
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
     code = 0
-    try:
+    with saving(f"--out={out}", "stopped"):
         if not values["redraw"].value:
             code = launching.run_sweep(root, manifest.resolve(runs), **how)
             if code >= 128:  # told to end
@@ -321,8 +321,6 @@ def run(values: flags.FlagValues) -> int:
                 if not code:
                     raise
                 display.say(str(error))  # of runs that failed, which the status says
-    except OSError as error:
-        raise SaveError(f"--out={out}: {error.strerror or error}") from error
     return code
 
 

@@ -21,7 +21,7 @@ from absl import flags
 
 from srl_jax import config as config_file
 from srl_jax.config import INFOS, Config
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display
 from srl_jax.files.metrics import parse_row
 from srl_jax.files.reading import ROWS as MOST_BYTES
@@ -283,7 +283,7 @@ def main(values: flags.FlagValues) -> None:
     one, other = runs.resolve(), out.resolve()
     if not values.unpack and (one == other or one in other.parents or other in one.parents):
         raise ConfigError(f"--out={values.out}: name a folder that is neither in --runs nor around it")
-    try:
+    with saving(f"--out={out}"):
         if values.unpack:
             print(f"{out}: {unpack(runs, out)} runs unpacked")
         else:
@@ -291,8 +291,6 @@ def main(values: flags.FlagValues) -> None:
             for path in left_out:
                 display.say(f"{path}: left out: it is under way, or was stopped or killed and can be resumed")
             print(f"{out}: {more} runs added, {count} in all")
-    except OSError as error:
-        raise SaveError(f"--out={out}: {error.strerror or error}") from error
 
 
 cli = config_flags.program(main, define_flags, positional="runs")

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files.reading import replace_text
 
 from .command_line import flags as config_flags
@@ -90,12 +90,10 @@ def report(values: flags.FlagValues) -> Path:
     table = path.with_suffix(".csv")
     same = {name: values[name].value for name in ("baseline", "force", "finished_only", "media")}
     html, rows = page.build(*runs, reach=reach, data=table.name, **same)
-    try:
+    with saving(f"--out={path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         for file, text in ((table, rows), (path, html)):
             replace_text(file, text)
-    except OSError as error:
-        raise SaveError(f"--out={path}: {error.strerror}") from None
     return path
 
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from absl import flags
 
 from srl_jax import envs
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display, rundir
 
 from .command_line import flags as config_flags
@@ -103,13 +103,11 @@ def main(values: flags.FlagValues) -> int:
     if values.dry_run:
         display.result("\n".join(status.dry_run(root, entries, workers)))
         return 0
-    try:
+    with saving(f"--out={values.out}", "stopped"):
         code = launching.run_sweep(root, entries, **how)
         if code < 128:  # not told to end
             if lines := status.best(collect.load_named(root, entries)):
                 display.result("\n".join(lines))
-    except OSError as error:
-        raise SaveError(f"--out={values.out}: {error.strerror or error}") from error
     return code
 
 

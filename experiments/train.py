@@ -18,7 +18,7 @@ from absl import flags
 
 from srl_jax import envs
 from srl_jax.config import INFOS, SOURCES, Config
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display
 from srl_jax.files.resuming import (
     MAY_CHANGE,
@@ -300,10 +300,8 @@ def draw(paths: list[Path], configs: list[Config], results: list) -> None:
         print("no figures: they need matplotlib and Pillow, pip install 'srl-jax[plots]'")
         return
     for path, config, result in zip(paths, configs, results, strict=True):
-        try:
+        with saving(path, "no figures"):
             draw_run(path, config, pictures=result.pictures, recording=result.recording)
-        except OSError as error:
-            raise SaveError(f"{path}: no figures: {error.strerror}") from error
 
 
 cli = config_flags.program(functools.partial(train, prepare=runtime.prepare), define_flags)

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from absl import flags
 
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files.reading import replace_text
 
 from ..command_line import paths
@@ -43,12 +43,10 @@ def write(out: Path, texts: Mapping[str, str]) -> None:
     Raises:
         SaveError: one cannot be written.
     """
-    try:
+    with saving(f"--out={out}"):
         out.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             replace_text(out / name, text + "\n")
-    except OSError as error:
-        raise SaveError(f"--out={out}: {error.strerror or error}") from error
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import jax
 
-from srl_jax.errors import ConfigError, SaveError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files import checkpoint
 from srl_jax.files.checkpoint import Manifest
 from srl_jax.learning.agent import Agent
@@ -70,10 +70,8 @@ def drop_after(run: Path, env_steps: int) -> None:
     """
     for path in (run / "best").glob("[0-9]*"):
         if int(path.name) > env_steps:
-            try:
+            with saving(path, "not removed"):
                 shutil.rmtree(path)
-            except OSError as error:
-                raise SaveError(f"{path}: not removed: {error.strerror or error}") from error
 
 
 @contextlib.contextmanager
