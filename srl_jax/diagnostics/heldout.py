@@ -1,7 +1,7 @@
 """The observations that every run of a game is measured on: the same for all arms and seeds."""
 
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -58,31 +58,16 @@ def collect(config: Config, horizon: int) -> HeldOut:
     Returns:
         Arrays that nobody may write to: seeds of one process share them.
     """
-    names = ("game", "frame_size", "frame_stack", "sticky_actions", "full_actions", "noop_max")
-    return _collect(*(getattr(config, name) for name in names), horizon, WINDOWS)
+    names = ("game", "frame_size", "sticky_actions", "full_actions", "noop_max")
+    options = {name: getattr(config, name) for name in names}
+    return _collect(config.frame_stack, horizon, WINDOWS, **options)
 
 
 @functools.lru_cache(maxsize=1)
-def _collect(
-    game: str,
-    size: int,
-    stack: int,
-    sticky_actions: float,
-    full_actions: bool,
-    noop_max: int,
-    horizon: int,
-    number: int,
-) -> HeldOut:
+def _collect(stack: int, horizon: int, number: int, **options: Any) -> HeldOut:
     steps = number * STRIDE // ENVS
     env = envs.make(
-        game,
-        num_envs=ENVS,
-        seed=seed_for(SEED, "held out", "environments"),
-        frame_size=size,
-        sticky_actions=sticky_actions,
-        full_actions=full_actions,
-        noop_max=noop_max,
-        with_state=True,
+        num_envs=ENVS, seed=seed_for(SEED, "held out", "environments"), with_state=True, **options
     )
     rng = np.random.default_rng(seed_for(SEED, "held out", "policy"))
     # In each environment one of every STRIDE steps, but none in the last ones.
