@@ -181,13 +181,9 @@ def _published(name: str, games: Sequence[str], common: Sequence[str]) -> dict[s
         }
     if common:
         means = {game: statistics.human_normalised(game, [scores[game].mean]) for game in common}
-        entry["aggregates"] = {
-            "mean": float(statistics.mean(means)),
-            "median": float(statistics.median(means)),
+        entry["aggregates"] = {name: float(of(means)) for name, of in _AGGREGATES.items()} | {
             "interquartile_mean": about.iqm_of_runs if set(common) == set(envs.SUITES["26"]) else None,
-            "interquartile_mean_of_means": float(statistics.interquartile_mean(means)),
             "optimality_gap": None,
-            "optimality_gap_of_means": float(statistics.optimality_gap(means)),
         }
     return entry
 
@@ -227,16 +223,18 @@ def _distance(game: str, mean: float, others: Sequence[str]) -> dict[str, Any]:
     return {"distances": distances, "verdict": verdict}
 
 
-def _of_means(scores: Mapping[str, np.ndarray], statistic: statistics.aggregates.Statistic) -> np.ndarray:
-    return statistic({game: x.mean(-1, keepdims=True) for game, x in scores.items()})
+def _of_means(statistic: statistics.aggregates.Statistic) -> statistics.aggregates.Statistic:
+    return lambda scores: statistic({game: x.mean(-1, keepdims=True) for game, x in scores.items()})
 
 
-def _iqm_of_means(scores: Mapping[str, np.ndarray]) -> np.ndarray:
-    return _of_means(scores, statistics.interquartile_mean)
-
-
-def _gap_of_means(scores: Mapping[str, np.ndarray]) -> np.ndarray:
-    return _of_means(scores, statistics.optimality_gap)
+_AGGREGATES: dict[str, statistics.aggregates.Statistic] = {
+    "mean": statistics.mean,
+    "median": statistics.median,
+    "interquartile_mean": statistics.interquartile_mean,
+    "interquartile_mean_of_means": _of_means(statistics.interquartile_mean),
+    "optimality_gap": statistics.optimality_gap,
+    "optimality_gap_of_means": _of_means(statistics.optimality_gap),
+}
 
 
 def _aggregates(raw: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
@@ -244,12 +242,4 @@ def _aggregates(raw: Mapping[str, np.ndarray]) -> dict[str, dict[str, Any]]:
     if not raw:
         return {}
     scores = {game: statistics.human_normalised(game, x) for game, x in raw.items()}
-    found = {
-        "mean": statistics.estimate(statistics.mean, scores),
-        "median": statistics.estimate(statistics.median, scores),
-        "interquartile_mean": statistics.estimate(statistics.interquartile_mean, scores),
-        "interquartile_mean_of_means": statistics.estimate(_iqm_of_means, scores),
-        "optimality_gap": statistics.estimate(statistics.optimality_gap, scores),
-        "optimality_gap_of_means": statistics.estimate(_gap_of_means, scores),
-    }
-    return {name: limits(interval) for name, interval in found.items()}
+    return {name: limits(statistics.estimate(of, scores)) for name, of in _AGGREGATES.items()}
