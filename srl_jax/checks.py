@@ -13,36 +13,28 @@ if TYPE_CHECKING:
     from srl_jax.config import Config
 
 
-def _such(holds: Callable[[Mode], Any]) -> str:
-    return f"modes that do: {', '.join(mode.name for mode in MODES.values() if holds(mode))}"
+def _of_mode(holds: Callable[[Mode], Any], why: str, *, such: bool = False) -> Callable[[Run], str]:
+    """A fact of a run's mode: "" where it holds, else why it does not, with `such` modes in which it does."""
+    names = (
+        f" (modes that do: {', '.join(mode.name for mode in MODES.values() if holds(mode))})" if such else ""
+    )
+
+    def fact(run: Run) -> str:
+        mode = MODES[run.config.mode]
+        return "" if holds(mode) else f"in --mode={mode.name}, {why}{names}"
+
+    return fact
 
 
-def _trains_rl(run: Run) -> str:
-    mode = MODES[run.config.mode]
-    return "" if mode.rl else f"in --mode={mode.name}, which trains no RL"
-
-
-def _acts_at_random(run: Run) -> str:
-    mode = MODES[run.config.mode]
-    return f"in --mode={mode.name}, which acts with the policy that it learns" if mode.rl else ""
-
-
-def _trains_objectives(run: Run) -> str:
-    mode = MODES[run.config.mode]
-    do = _such(lambda mode: mode.representation)
-    return "" if mode.representation else f"in --mode={mode.name}, which runs no representation loss ({do})"
-
-
-def _moves_encoder(run: Run) -> str:
-    mode = MODES[run.config.mode]
-    moves = mode.rl_trains_encoder or mode.representation_trains_encoder
-    return "" if moves else f"in --mode={mode.name}, which never moves the encoder"
-
-
-def _could_share(run: Run) -> str:
-    mode = MODES[run.config.mode]
-    never = f"in --mode={mode.name}, where RL and representation do not both train the encoder"
-    return "" if both_train(mode) else f"{never} ({_such(both_train)})"
+_trains_rl = _of_mode(lambda mode: mode.rl, "which trains no RL")
+_acts_at_random = _of_mode(lambda mode: not mode.rl, "which acts with the policy that it learns")
+_trains_objectives = _of_mode(
+    lambda mode: mode.representation, "which runs no representation loss", such=True
+)
+_moves_encoder = _of_mode(
+    lambda mode: mode.rl_trains_encoder or mode.representation_trains_encoder, "which never moves the encoder"
+)
+_could_share = _of_mode(both_train, "where RL and representation do not both train the encoder", such=True)
 
 
 def _shares(run: Run) -> str:
