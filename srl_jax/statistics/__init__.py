@@ -31,7 +31,7 @@ from srl_jax.statistics.aggregates import (
     performance_profile,
     probability_of_improvement,
 )
-from srl_jax.statistics.curves import Reached, area_under_curve, at_equal_steps, reached, steps_to
+from srl_jax.statistics.curves import area_under_curve, at_equal_steps, steps_to
 from srl_jax.statistics.estimates import curve_interval, estimate, estimate_difference
 from srl_jax.statistics.intervals import (
     BOOTSTRAP,
@@ -61,10 +61,10 @@ from srl_jax.statistics.table import runs_text, summary
 
 __all__ = [
     "AGGREGATES", "BOOTSTRAP", "ENOUGH", "MOST", "NARROW", "NONE", "STRATIFIED", "STUDENT", "WELCH",
-    "Interval", "Reached", "area_under_curve", "at_equal_steps", "bootstrap", "bootstrap_curve",
+    "Interval", "area_under_curve", "at_equal_steps", "bootstrap", "bootstrap_curve",
     "bootstrap_difference", "contrast", "curve_interval", "estimate", "estimate_difference",
     "human_normalised", "interquartile_mean", "mean", "mean_difference", "mean_interval", "median",
     "optimality_gap", "percentile_interval", "performance_profile", "probability_of_improvement",
-    "reached", "runs_needed", "runs_text", "smallest_effect", "steps_to", "stratified_interval",
+    "runs_needed", "runs_text", "smallest_effect", "steps_to", "stratified_interval",
     "summary", "t_probability", "t_quantile", "welch_p", "welch_power",
 ]  # fmt: skip

@@ -5,23 +5,9 @@ evaluations, and nothing before the first or after the last.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-
-
-class Reached(NamedTuple):
-    """When the runs of an arm reached a score.
-
-    Attributes:
-        reached: the number of runs that did.
-        runs: of how many.
-        median: env steps, the median over all runs, where never counts as infinity; so it may be infinite.
-    """
-
-    reached: int
-    runs: int
-    median: float
 
 
 def at_equal_steps(curves: Sequence[tuple[Any, Any]]) -> tuple[np.ndarray, np.ndarray]:
@@ -97,16 +83,6 @@ def steps_to(steps: Any, returns: Any, score: float) -> np.ndarray:
     share = np.where(first > 0, (score - low) / rise, 0.0)
     at = steps[before] + share * (steps[first] - steps[before])
     return np.where(above.any(-1), at[..., 0], np.nan)
-
-
-def reached(steps: Any) -> Reached:
-    """Summarises `steps_to` of several runs, [runs]; NaN is never."""
-    steps = np.asarray(steps, np.float64)
-    never = np.isnan(steps)
-    if not steps.size:
-        raise ValueError("no runs")
-    # Of an even number, the median is infinite as soon as the upper of the two in the middle is.
-    return Reached(int((~never).sum()), steps.size, float(np.median(np.where(never, np.inf, steps))))
 
 
 def _curve(steps: Any, returns: Any) -> tuple[np.ndarray, np.ndarray]:

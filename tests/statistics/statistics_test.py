@@ -31,7 +31,6 @@ from srl_jax.statistics import (
     percentile_interval,
     performance_profile,
     probability_of_improvement,
-    reached,
     runs_text,
     steps_to,
     stratified_interval,
@@ -396,7 +395,6 @@ def test_a_single_run_has_no_interval():
         (lambda: at_equal_steps([([0, 10], [1, np.inf])]), "must be finite"),
         (lambda: at_equal_steps([([0, 10], [1])]), "steps .N. and returns"),
         (lambda: area_under_curve([0, 10], [1, 2], until=11), "until=11"),
-        (lambda: reached([]), "no runs"),
         (lambda: summary({"a": {"Pong": [1]}}, baseline="b"), "baseline b is not one of the arms: a"),
     ],
 )
@@ -455,13 +453,6 @@ def test_steps_to_a_score_lie_on_the_line_that_crosses_it_first():
     curves = [[0, 4, 0, 8], [3, 0, 0, 9], [0, 1, 2, 2], [0, 0, 3, 3]]
     np.testing.assert_allclose(steps_to(steps, curves, 3), [7.5, 0, np.nan, 20])
     assert steps_to(steps, curves[0], 4) == 10
-
-
-def test_a_run_that_never_reached_a_score_counts_as_infinitely_late():
-    assert reached([30, np.nan, 10]) == (2, 3, 30)
-    assert reached([np.nan, np.nan, 10]) == (1, 3, np.inf)
-    assert reached([10, 20, np.nan, np.nan]) == (2, 4, np.inf)
-    assert reached([10, 20]) == (2, 2, 15)
 
 
 def test_a_summary_has_every_number_with_its_interval_and_its_runs():
