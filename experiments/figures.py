@@ -149,7 +149,7 @@ def evaluated(
 def _curve(arm: Sequence[tuple[np.ndarray, np.ndarray]]) -> dict[str, Any]:
     """The learning curve of an arm on a game: at its own steps, that all of its runs have."""
     grid, returns = statistics.at_equal_steps(arm)
-    interval = statistics.curve_interval(returns)
+    interval = statistics.mean_interval(returns.T)
     return {"env_steps": grid.tolist(), **limits(interval), "runs": plain(returns)}
 
 

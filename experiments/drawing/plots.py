@@ -106,7 +106,7 @@ def interval_curve(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | Non
         steps, values = statistics.at_equal_steps(kept)
     except ValueError:
         return None
-    return Curve(steps, *statistics.curve_interval(values)[:3])
+    return Curve(steps, *statistics.mean_interval(values.T)[:3])
 
 
 def draw_panels(

@@ -6,11 +6,11 @@ before them. Definitions are those of Agarwal et al., "Deep reinforcement learni
 statistical precipice", 2021, and of its library rliable, with which the tests compare. Every game weighs the
 same: where numbers of runs differ, a run of a game with few of them weighs more.
 
-Which interval is right for what is decided in `estimates.py`, behind `estimate`, `estimate_difference` and
-`curve_interval`: t intervals for means on one game (Student's of an arm, Welch's of a difference) and over
-games, and for interquartile means of few runs; for all else percentile intervals of the stratified bootstrap,
-which draws runs again within each game. An `Interval` says which it is. A single run has none: its limits are
-NaN.
+Which interval is right for what is decided in `estimates.py`, behind `estimate` and `estimate_difference`: t
+intervals for means on one game (Student's of an arm, Welch's of a difference) and over games, and for
+interquartile means of few runs; for all else percentile intervals of the stratified bootstrap, which draws
+runs again within each game. At the points of learning curves [runs, points] it is `mean_interval(returns.T)`.
+An `Interval` says which it is. A single run has none: its limits are NaN.
 
 With few runs the bootstrap is too narrow. docs/figures.md has which share of intervals at 95 % contains the
 truth, and experiments/results/coverage/README.md has it of more sources of returns. That Welch's interval
@@ -32,7 +32,7 @@ from srl_jax.statistics.aggregates import (
     probability_of_improvement,
 )
 from srl_jax.statistics.curves import area_under_curve, at_equal_steps, steps_to
-from srl_jax.statistics.estimates import curve_interval, estimate, estimate_difference
+from srl_jax.statistics.estimates import estimate, estimate_difference
 from srl_jax.statistics.intervals import (
     BOOTSTRAP,
     ENOUGH,
@@ -43,7 +43,6 @@ from srl_jax.statistics.intervals import (
     WELCH,
     Interval,
     bootstrap,
-    bootstrap_curve,
     bootstrap_difference,
     percentile_interval,
 )
@@ -61,10 +60,10 @@ from srl_jax.statistics.table import runs_text, summary
 
 __all__ = [
     "AGGREGATES", "BOOTSTRAP", "ENOUGH", "MOST", "NARROW", "NONE", "STRATIFIED", "STUDENT", "WELCH",
-    "Interval", "area_under_curve", "at_equal_steps", "bootstrap", "bootstrap_curve",
-    "bootstrap_difference", "contrast", "curve_interval", "estimate", "estimate_difference",
-    "human_normalised", "interquartile_mean", "mean", "mean_difference", "mean_interval", "median",
-    "optimality_gap", "percentile_interval", "performance_profile", "probability_of_improvement",
-    "runs_needed", "runs_text", "smallest_effect", "steps_to", "stratified_interval",
-    "summary", "t_probability", "t_quantile", "welch_p", "welch_power",
+    "Interval", "area_under_curve", "at_equal_steps", "bootstrap", "bootstrap_difference", "contrast",
+    "estimate", "estimate_difference", "human_normalised", "interquartile_mean", "mean",
+    "mean_difference", "mean_interval", "median", "optimality_gap", "percentile_interval",
+    "performance_profile", "probability_of_improvement", "runs_needed", "runs_text", "smallest_effect",
+    "steps_to", "stratified_interval", "summary", "t_probability", "t_quantile", "welch_p",
+    "welch_power",
 ]  # fmt: skip

@@ -11,7 +11,6 @@
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
@@ -26,14 +25,7 @@ from srl_jax.statistics.aggregates import (
     median,
     optimality_gap,
 )
-from srl_jax.statistics.intervals import (
-    REPETITIONS,
-    Interval,
-    bootstrap,
-    bootstrap_curve,
-    bootstrap_difference,
-    curves_by_game,
-)
+from srl_jax.statistics.intervals import REPETITIONS, Interval, bootstrap, bootstrap_difference
 from srl_jax.statistics.student import contrast, mean_difference, stratified_interval
 
 MEANS = (mean, optimality_gap)
@@ -92,27 +84,6 @@ def estimate_difference(
             return mean_difference(groups[0], groups[1], level)
         return contrast(groups, np.repeat([1 / len(mine), -1 / len(mine)], len(mine)), level)
     return bootstrap_difference(ours, theirs, statistic, level=level, **how)
-
-
-def curve_interval(returns: Any, statistic: Statistic = mean, *, level: float = 0.95, **how: int) -> Interval:
-    """A statistic of learning curves, and at each point the interval that is right for it.
-
-    Args:
-        returns: float64 [runs, points] of one game, [runs, games, points], or game -> [runs, points].
-        statistic: of one arm's scores.
-        level: of the interval at one point; not of the whole curve.
-        **how: repetitions and seed, see `estimate`.
-
-    Returns:
-        An Interval of arrays [points].
-
-    Raises:
-        ValueError: the curves have another form, or see `bootstrap`.
-    """
-    games = curves_by_game(returns)
-    if (terms := _terms(statistic, games)) is not None:
-        return stratified_interval(terms, level)
-    return bootstrap_curve(returns, statistic, level=level, **how)
 
 
 def _terms(

@@ -16,9 +16,6 @@ NARROW, NONE = "stratified bootstrap, too narrow", "none"
 ENOUGH = 5
 """Runs of each game from which the bootstrap's interval is not called too narrow."""
 
-_BLOCK = 1 << 22
-"""Scores that are drawn again at once, 32 MiB of them."""
-
 
 class Interval(NamedTuple):
     """An estimate and its interval.
@@ -98,60 +95,6 @@ def percentile_interval(values: np.ndarray, level: float = 0.95) -> tuple[np.nda
     tail = (1 - level) / 2
     low, high = np.percentile(values, [100 * tail, 100 * (1 - tail)], axis=0)
     return low, high
-
-
-def bootstrap_curve(
-    returns: Any,
-    statistic: Statistic = mean,
-    *,
-    repetitions: int = REPETITIONS,
-    level: float = 0.95,
-    seed: int = 0,
-) -> Interval:
-    """A statistic of learning curves and its percentile interval at each point; whole curves are drawn again.
-
-    Args:
-        returns: see `curves_by_game`.
-        statistic: of one arm's scores.
-        repetitions: see `bootstrap`.
-        level: of the interval at one point; not of the whole curve.
-        seed: of the draws.
-
-    Returns:
-        An Interval of arrays [points].
-    """
-    games = curves_by_game(returns)
-    draws = _draw(games, repetitions, np.random.default_rng(seed))
-    block = max(1, _BLOCK // (repetitions * sum(x.shape[-1] for x in games.values())))
-    points = next(iter(games.values())).shape[0]
-    limits = []
-    for start in range(0, points, block):
-        again = (x[start : start + block, draw] for x, draw in zip(games.values(), draws, strict=True))
-        values = statistic(dict(zip(games, again, strict=True)))
-        limits.append(percentile_interval(np.moveaxis(values, 1, 0), level))
-    low, high = (np.concatenate(limit) for limit in zip(*limits, strict=True))
-    return _interval(statistic(games), low, high, games)
-
-
-def curves_by_game(returns: Any) -> dict[str, np.ndarray]:
-    """Learning curves as scores, game -> float64 [points, runs].
-
-    Args:
-        returns: float64 [runs, points] of one game, [runs, games, points], or game -> [runs, points].
-
-    Raises:
-        ValueError: they have another form, or what `mean` raises.
-    """
-    if not isinstance(returns, Mapping):
-        returns = np.asarray(returns, np.float64)
-        if returns.ndim not in (2, 3):
-            raise ValueError("curves are [runs, points], [runs, games, points], or game -> [runs, points]")
-        games = returns[:, None] if returns.ndim == 2 else returns
-        returns = {str(i): games[:, i] for i in range(games.shape[1])}
-    curves = {game: np.asarray(x, np.float64) for game, x in returns.items()}
-    if any(x.ndim != 2 for x in curves.values()) or len({x.shape[1] for x in curves.values()}) != 1:
-        raise ValueError("curves of all games and runs must have the same points; see at_equal_steps")
-    return by_game({game: x.T for game, x in curves.items()})
 
 
 def check_level(level: float) -> None:

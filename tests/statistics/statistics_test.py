@@ -18,7 +18,6 @@ from srl_jax.statistics import (
     bootstrap,
     bootstrap_difference,
     contrast,
-    curve_interval,
     estimate,
     estimate_difference,
     human_normalised,
@@ -317,9 +316,6 @@ def test_which_interval_is_right_for_what():
     difference = estimate_difference(two, {"a": [1.0, 2.0], "b": [0.0, 5.0, 7.0]})
     groups = [*two.values(), [1.0, 2.0], [0.0, 5.0, 7.0]]
     assert difference == contrast(groups, (0.5, 0.5, -0.5, -0.5))
-    curves = np.arange(24.0).reshape(3, 2, 4) ** 2
-    found = curve_interval(curves)
-    assert [x[1] for x in found[:3]] == pytest.approx(estimate(mean, curves[..., 1])[:3])
     with pytest.raises(ValueError, match="the games differ: a, b and a"):
         estimate_difference(two, one)
 
@@ -369,7 +365,7 @@ def test_a_single_run_has_no_interval():
     point, low, high, kind = bootstrap(mean, {"a": [1.0], "b": [2.0, 4.0]})
     assert kind == statistics.NONE
     assert point == 2 and np.isnan(low) and np.isnan(high)
-    assert np.isnan(curve_interval([[1.0, 2.0]]).low).all()
+    assert np.isnan(mean_interval([[1.0], [2.0]]).low).all()
 
 
 @pytest.mark.parametrize(
@@ -383,8 +379,6 @@ def test_a_single_run_has_no_interval():
         (lambda: bootstrap(mean, SCORES, repetitions=0), "repetitions=0"),
         (lambda: bootstrap(mean, SCORES, level=1.0), "level=1.0"),
         (lambda: bootstrap_difference(SCORES, SCORES[:, :2]), "the games differ"),
-        (lambda: curve_interval([1.0, 2.0]), "curves are"),
-        (lambda: curve_interval({"a": np.ones((2, 3)), "b": np.ones((2, 4))}), "same points"),
         (lambda: mean_interval([]), "no runs"),
         (lambda: mean_interval(1.0), "no runs"),
         (lambda: mean_difference([1, 2], [1, np.inf]), "not all finite"),
@@ -403,21 +397,13 @@ def test_what_cannot_be_computed_is_said_in_a_line(call, message):
         call()
 
 
-def test_curves_have_the_interval_that_their_points_have(monkeypatch):
-    curves = np.sort(np.random.default_rng(7).normal(size=(5, 3, 4)), axis=0)  # as bootstrap sorts runs
-    found = curve_interval(curves, interquartile_mean, seed=9, repetitions=200)[:3]
+def test_a_curve_has_the_interval_that_its_points_have():
+    curves = np.random.default_rng(7).normal(size=(5, 4))
+    found = mean_interval(curves.T)
     for point in range(4):
-        expected = bootstrap(interquartile_mean, curves[..., point], seed=9, repetitions=200)
-        np.testing.assert_allclose([x[point] for x in found], expected[:3], rtol=1e-12)
-    monkeypatch.setattr("srl_jax.statistics.intervals._BLOCK", 1)  # a point at a time
-    again = curve_interval(curves, interquartile_mean, seed=9, repetitions=200)
-    np.testing.assert_array_equal(found, again[:3])
-    one = curve_interval(curves[:, 0])
-    np.testing.assert_array_equal(one[:3], curve_interval({"Pong": curves[:, 0]})[:3])
-    for point in range(4):
-        expected = mean_interval(curves[:, 0, point])
-        assert [x[point] for x in one[:3]] == pytest.approx(expected[:3], rel=1e-12)
-    assert one.kind == statistics.STUDENT
+        expected = mean_interval(curves[:, point])
+        assert [x[point] for x in found[:3]] == pytest.approx(expected[:3], rel=1e-12)
+    assert found.kind == statistics.STUDENT
 
 
 def test_curves_meet_where_all_of_them_are():
