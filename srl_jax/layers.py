@@ -6,9 +6,9 @@ slower than the same layer written as a pad and a VALID convolution.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import flax.linen as nn
 import jax
@@ -24,6 +24,24 @@ MIN_RANGE = 1e-5
 """The least that `min_max` divides by."""
 FEW_ROWS = 16
 """A noisy layer of no more rows multiplies by mu and by sigma, and does not write down their noisy sum."""
+
+
+def functions(network: nn.Module, *shapes: tuple[int, ...]) -> tuple[Callable[[Array], Any], Callable]:
+    """A module's functions: key -> params, and (params, *inputs) -> output.
+
+    Args:
+        network: of which all variables are parameters.
+        shapes: of its inputs, float32, one by one; `apply` may be given more.
+    """
+
+    def init(key: Array) -> Any:
+        examples = (jnp.zeros(shape, jnp.float32) for shape in shapes)
+        return network.init(key, *examples).get("params", {})
+
+    def apply(params: Any, *inputs: Any) -> Any:
+        return network.apply({"params": params}, *inputs)
+
+    return init, apply
 
 
 def uniform_fan_in(fan_in: int):

@@ -1,13 +1,11 @@
 """An `Encoder` of any flax module."""
 
-from collections.abc import Callable
-from typing import Any
-
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from srl_jax.types import Array, Decoder, Encoder, Params
+from srl_jax.layers import functions
+from srl_jax.types import Decoder, Encoder
 
 
 def flax_encoder(
@@ -47,26 +45,11 @@ def flax_encoder(
         if output.shape != image.shape:
             wanted, given = _text(image.shape), _text(output.shape)
             raise ValueError(f"{_name(decoder_network)} must give images {wanted}, not {given}")
-        return Decoder(*_functions(decoder_network, z))
+        return Decoder(*functions(decoder_network, z.shape))
 
-    init, apply = _functions(network, image)
+    init, apply = functions(network, image.shape)
     encoder = Encoder(init, apply, features, tuple(shape), make_decoder, map_shape)
     return encoder._replace(train=apply) if noisy else encoder
-
-
-def _functions(
-    network: nn.Module, example: jax.ShapeDtypeStruct
-) -> tuple[Callable[[jax.Array], Params], Callable[..., jax.Array]]:
-    """key -> params, and (params, inputs, more inputs if any) -> outputs."""
-
-    def init(key: jax.Array) -> Params:
-        return network.init(key, jnp.zeros(example.shape, example.dtype)).get("params", {})
-
-    def apply(params: Params, *inputs: Array) -> jax.Array:
-        output: Any = network.apply({"params": params}, *inputs)
-        return output
-
-    return init, apply
 
 
 def _checked(network: nn.Module, example: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:

@@ -7,6 +7,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from srl_jax import layers
 from srl_jax.layers import Dense
 from srl_jax.types import Array, Params
 
@@ -35,16 +36,8 @@ class MLP(nn.Module):
 
 
 def functions(network: nn.Module, *inputs: int) -> tuple[Callable[[jax.Array], Params], Callable]:
-    """init: key -> params, and apply: (params, *arrays) -> output, of a network over [B, input] arrays."""
-    examples = [jnp.zeros((1, size), jnp.float32) for size in inputs]
-
-    def init(key: jax.Array) -> Params:
-        return network.init(key, *examples)["params"]
-
-    def apply(params: Params, *arrays: Array) -> jax.Array:
-        return network.apply({"params": params}, *arrays)  # type: ignore[return-value]
-
-    return init, apply
+    """`srl_jax.layers.functions` of a network over arrays [B, input]."""
+    return layers.functions(network, *((1, size) for size in inputs))
 
 
 def join(*arrays: Array) -> jax.Array:
