@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from srl_jax.layers import Dense
-from srl_jax.objectives.networks import functions, one_hot
-from srl_jax.objectives.reconstruction import mean_squared_error
+from srl_jax.objectives.networks import functions, mean_squared_error, one_hot
 from srl_jax.specs import check_choice, check_size
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.window import image

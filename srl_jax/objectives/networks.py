@@ -50,8 +50,11 @@ def one_hot(actions: Array, num_actions: int) -> jax.Array:
     return jax.nn.one_hot(actions, num_actions, dtype=jnp.float32)
 
 
-def squared_distance(x: Array, y: Array) -> jax.Array:
-    """The squared distance of two vectors, a mean over their elements: float32 [D], [D] -> float32 []."""
+def mean_squared_error(x: Array, y: Array) -> jax.Array:
+    """The squared difference of two vectors or images, float32 of one shape, averaged over it: float32 [].
+
+    A mean, not a sum: of images of 84 x 84 x 4 the two differ by a factor of 28,224.
+    """
     return jnp.mean((x - y) ** 2)
 
 
@@ -70,7 +73,7 @@ def unit(x: Array) -> jax.Array:
     return jnp.where(zero, 0.0, x * jax.lax.rsqrt(jnp.where(zero, 1.0, square)))
 
 
-DISTANCES = {"squared": squared_distance, "cosine": cosine_distance}
+DISTANCES = {"squared": mean_squared_error, "cosine": cosine_distance}
 """{name: (prediction [D], target [D]) -> float32 []}, the options `distance`."""
 
 

@@ -3,25 +3,13 @@
 import jax
 import jax.numpy as jnp
 
-from srl_jax.objectives.networks import unit
+from srl_jax.objectives.networks import mean_squared_error, unit
 from srl_jax.specs import check_size, needs
 from srl_jax.types import Array, Context, Latents, Objective, Params, Window
 from srl_jax.window import image, to_unit
 
 POWER_ITERATIONS = 5
 """Of `largest_singular_value`."""
-
-
-def mean_squared_error(output: Array, target: Array) -> jax.Array:
-    """The squared error of an image, averaged over all its pixels and channels.
-
-    Args:
-        output, target: float32 [H, W, S * C], in units of full brightness; a target is in [0, 1].
-
-    Returns:
-        float32 []. A mean, not a sum: at 84 x 84 x 4 the two differ by a factor of 28,224.
-    """
-    return jnp.mean((output - target) ** 2)
 
 
 def weighted_squared_error(output: Array, target: Array, weights: Array) -> jax.Array:

@@ -14,7 +14,7 @@ from srl_jax.latents import make_latents
 from srl_jax.objectives.bisimulation import bisimulation_error
 from srl_jax.objectives.infonce import info_nce
 from srl_jax.objectives.latent_l2 import l2_norm
-from srl_jax.objectives.networks import cosine_distance, over_others, squared_distance
+from srl_jax.objectives.networks import cosine_distance, mean_squared_error, over_others
 from srl_jax.objectives.reward import binary_cross_entropy, symlog, two_hot
 from srl_jax.objectives.slowness import similarity, squared_step
 from srl_jax.objectives.spr import min_max
@@ -39,7 +39,7 @@ BATCH, D = 4, 5
 
 def test_distances_by_hand():
     # Mean of 1, 4, 0; a right angle; the same direction; the opposite one.
-    assert float(squared_distance(np.array([1.0, 2, 3]), np.array([0.0, 0, 3]))) == pytest.approx(5 / 3)
+    assert float(mean_squared_error(np.array([1.0, 2, 3]), np.array([0.0, 0, 3]))) == pytest.approx(5 / 3)
     x = np.array([3.0, 4.0])
     for y, expected in (([-4.0, 3.0], 2), (2 * x, 0), (-x, 4)):
         assert float(cosine_distance(x, np.array(y))) == pytest.approx(expected, abs=1e-6)

@@ -19,7 +19,6 @@ from srl_jax.learning.optim import RL, make_optimizer
 from srl_jax.learning.update import Hyper, make_init, make_update, periodic
 from srl_jax.objectives.inverse import action_cross_entropy
 from srl_jax.objectives.latent_l2 import half_squared_norm
-from srl_jax.objectives.reconstruction import mean_squared_error
 from srl_jax.types import Context, Latents, Objective, TrainState, Window
 from srl_jax.window import image
 from tests import helpers
@@ -28,12 +27,6 @@ from tests.helpers import SIZE, STACK, make_context, make_encoder, make_window
 BATCH = 4
 
 # One by one
-
-
-def test_mean_squared_error_by_hand():
-    # Errors 1, 0, -0.5, 0: (1 + 0.25) / 4.
-    output, target = np.array([1, 0.5, 0, 0]), np.array([0, 0.5, 0.5, 0])
-    assert float(mean_squared_error(output, target)) == pytest.approx(0.3125)
 
 
 def test_half_squared_norm_by_hand():
