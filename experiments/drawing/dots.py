@@ -1,5 +1,6 @@
 """A picture of scores game by game: a dot an arm, on the spread of published runs. See `runs.scores`."""
 
+import itertools
 import os
 import textwrap
 from collections.abc import Mapping
@@ -38,7 +39,8 @@ def draw(numbers: Mapping[str, Any], path: str | os.PathLike) -> Path:
     handles: dict[str, Any] = {}
     shown: list[float] = [0.0, 1.0]
     places = np.linspace(-0.22, 0.22, len(published)) if len(published) > 1 else np.zeros(1)
-    for (name, entry), marker, place in zip(published.items(), _cycle(len(published)), places, strict=False):
+    markers = itertools.cycle(MARKERS)
+    for (name, entry), marker, place in zip(published.items(), markers, places, strict=False):
         known = {game: x for game, x in entry["games"].items() if game in at}
         rows = [at[game] + place for game in known]
         means = [x["normalised"] for x in known.values()]
@@ -111,10 +113,6 @@ def _order(numbers: Mapping[str, Any]) -> list[str]:
     return sorted(games, key=lambda game: -first[game]["normalised"]["mean"] if game in first else 0.0)
 
 
-def _cycle(count: int) -> list[str]:
-    return [MARKERS[i % len(MARKERS)] for i in range(count)]
-
-
 def _notes(numbers: Mapping[str, Any]) -> list[str]:
     found = []
     for arm, entry in numbers["arms"].items():
@@ -127,10 +125,7 @@ def _notes(numbers: Mapping[str, Any]) -> list[str]:
     for name in ("without_runs", "left_out"):
         if numbers[name]:
             found.append(f"{name.replace('_', ' ')}: {len(numbers[name])}")
-    ring = (
-        f"ring: more than {FAR:g} standard deviations over published runs above or below all published means"
-    )
-    found += (
-        [ring] if any(x["verdict"] for arm in numbers["arms"].values() for x in arm["games"].values()) else []
-    )
+    if any(x["verdict"] for arm in numbers["arms"].values() for x in arm["games"].values()):
+        away = f"more than {FAR:g} standard deviations over published runs"
+        found.append(f"ring: {away} above or below all published means")
     return found + (["PROTOCOLS DIFFER between runs"] if numbers["forced"] else [])

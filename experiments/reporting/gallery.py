@@ -166,7 +166,8 @@ def differences(game: str, tables: Sequence[Mapping[str, Any]], looks: Looks, ba
     arms = panels[names[0]]
     if all(np.isnan(interval.low) for interval in arms.values()):
         return []
-    picture = pictures.differences(game, baseline, panels, [looks[arm] for arm in arms])
+    styles = [looks[arm] for arm in arms]
+    picture = pictures.drawn(lambda path: plots.differences(game, baseline, panels, styles, path))
     return [Shown(picture, f"{game}: differences from {baseline}")]
 
 

@@ -7,7 +7,6 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax import statistics
 from srl_jax.errors import ConfigError
 from srl_jax.files.reading import read_bytes
 
@@ -125,10 +124,3 @@ def curves(
     levels = [plots.Level(*policy) for policy in (policies or {}).items()]
     panel = plots.Panel("", named, (), levels, title, across, limits)
     return drawn(lambda path: plots.draw_panels([panel], path, "", "", looks, label, size))
-
-
-def differences(
-    title: str, baseline: str, panels: Mapping[str, Mapping[str, statistics.Interval]], looks: Sequence[Style]
-) -> Picture:
-    """A picture of how arms differ from the baseline, see `plots.differences`."""
-    return drawn(lambda path: plots.differences(title, baseline, panels, looks, path))
