@@ -69,16 +69,15 @@ def filled(page: str, results: Path = RESULTS) -> str:
     return MARK.sub(lambda mark: f"{mark[1]}{texts[mark['what']]}{mark[4]}", page)
 
 
-def surviving(differences: Mapping[str, Sequence[np.ndarray]], level: float = 0.95) -> set[str]:
+def surviving(differences: Mapping[str, Sequence[np.ndarray]]) -> set[str]:
     """The differences that are told from 0 after Holm's correction for all of them (Holm 1979).
 
     Args:
         differences: name -> runs of each arm, as `difference` gives them.
-        level: of the interval that one of them alone would have.
     """
     kept: set[str] = set()
     while True:  # those whose p is below the limit of the smallest one that is left
-        limit = 1 - (1 - level) / max(len(differences) - len(kept), 1)
+        limit = 1 - (1 - 0.95) / max(len(differences) - len(kept), 1)
         found = {
             name: statistics.contrast(arms, WEIGHTS[: len(arms)], limit)
             for name, arms in differences.items()

@@ -67,9 +67,7 @@ class _Serializer(flags.ArgumentSerializer):
         return "off" if value is None else specs.value_text(value)
 
 
-def define(
-    name: str, info: Info, default: Any, values: flags.FlagValues = flags.FLAGS, note: str = ""
-) -> None:
+def define(name: str, info: Info, default: Any, values: flags.FlagValues = flags.FLAGS) -> None:
     """Defines a flag whose values an Info describes and checks.
 
     Args:
@@ -77,9 +75,8 @@ def define(
         info: its type, help and limits.
         default: its value where it is not given; need not keep to the limits.
         values: where to define it.
-        note: more for --help.
     """
-    text = info.help + (f" [{info.unit}]" if info.unit else "") + note
+    text = info.help + (f" [{info.unit}]" if info.unit else "")
     if info.choices:
         text += f"; one of: {', '.join(info.choices)}"
     if info.kind is tuple:

@@ -203,7 +203,7 @@ def prepare(tune: str, encoder: str, env: MutableMapping[str, str] = os.environ)
         env.update(new)
 
 
-def check_device(env: Mapping[str, str] = os.environ) -> None:
+def check_device() -> None:
     """Whether jax finds a device of the kind that JAX_PLATFORMS asks for; imports jax.
 
     Raises:
@@ -216,6 +216,6 @@ def check_device(env: Mapping[str, str] = os.environ) -> None:
     except Exception as error:  # of several kinds, some without a text
         why = f" ({str(error).splitlines()[0]})" if str(error) else ""
         raise ConfigError(
-            f"JAX_PLATFORMS={env.get('JAX_PLATFORMS', '')}: jax finds no such device{why}; "
+            f"JAX_PLATFORMS={os.environ.get('JAX_PLATFORMS', '')}: jax finds no such device{why}; "
             "JAX_PLATFORMS=cpu runs on the processor"
         ) from None

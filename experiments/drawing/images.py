@@ -64,13 +64,12 @@ def image_panel(
     return plots.save(figure, path)
 
 
-def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int = 3) -> Path:
+def gif(frames: np.ndarray, path: str | os.PathLike, scale: int = 3) -> Path:
     """Writes frames as a GIF that repeats for ever; returns the path, whose directory it makes.
 
     Args:
         frames: uint8 [T, H, W, C], C of 1 (grey) or 3 (RGB), T at least 1.
         path: of the file.
-        fps: frames a second; a GIF counts in hundredths of a second, and is rounded to them.
         scale: every pixel becomes a square of this many pixels a side.
 
     Raises:
@@ -86,6 +85,6 @@ def gif(frames: np.ndarray, path: str | os.PathLike, fps: float = 15, scale: int
     first, *others = [Image.fromarray(frame[..., 0] if frame.shape[-1] == 1 else frame) for frame in frames]
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    duration = 10 * max(round(100 / fps), 2)  # milliseconds; browsers slow down a GIF with shorter frames
-    first.save(path, format="GIF", save_all=True, append_images=others, duration=duration, loop=0)
+    # In milliseconds, whole hundredths of a second: about 15 frames a second.
+    first.save(path, format="GIF", save_all=True, append_images=others, duration=70, loop=0)
     return path

@@ -202,18 +202,18 @@ def has_policy(run: RunData) -> bool:
     return MODES[run.config.mode].rl
 
 
-def comparable(runs: Sequence[RunData], key: str = RETURN) -> list[RunData]:
-    """Runs whose curves of a key can be laid beside each other, in their order; the others, `left_out` has.
+def comparable(runs: Sequence[RunData]) -> list[RunData]:
+    """Runs whose curves of returns can be laid beside each other, in their order; the others, `left_out` has.
 
     One that ended with an error is left out however far it got, one without evaluations, and one with a
     single evaluation where others of its game have more: it has only just begun. Each would cut the curves of
     all others down to where it is.
     """
-    return [run for run, why in zip(runs, _why_not(runs, key), strict=True) if not why]
+    return [run for run, why in zip(runs, _why_not(runs, RETURN), strict=True) if not why]
 
 
 def left_out(runs: Sequence[RunData], key: str = RETURN) -> list[tuple[RunData, str]]:
-    """The runs that are not `comparable`, and why; of returns, those with a policy."""
+    """The runs that are not `comparable`, by this key, and why; of returns, those with a policy."""
     whys = zip(runs, _why_not(runs, key), strict=True)
     return [(run, why) for run, why in whys if why and (key != RETURN or has_policy(run))]
 

@@ -2,7 +2,6 @@
 
 import fnmatch
 import itertools
-import os
 import re
 import sys
 from collections.abc import Mapping, Sequence
@@ -228,7 +227,7 @@ def presets(patterns: Sequence[str]) -> list[str]:
     return [name + pieces for pieces, names in found.items() for name in PRESETS if name in names]
 
 
-def parse_seeds(text: str, flag: str = "seeds") -> list[int]:
+def parse_seeds(text: str) -> list[int]:
     """`5` is the seeds 0 to 4; `0,3,7` are those; `3,` is 3 alone.
 
     Raises:
@@ -240,31 +239,27 @@ def parse_seeds(text: str, flag: str = "seeds") -> list[int]:
         for number in numbers:
             INFOS["seed"].check(number)
     except ValueError as error:
-        raise ConfigError(f"--{flag}={text}: {error}; give a number of seeds, or seeds as in 0,3,7") from None
+        raise ConfigError(f"--seeds={text}: {error}; give a number of seeds, or seeds as in 0,3,7") from None
     if not numbers or (len(parts) == 1 and not 0 < numbers[0] <= 10_000):
-        raise ConfigError(f"--{flag}={text}: give a number of seeds from 1 to 10000, or seeds as in 0,3,7")
+        raise ConfigError(f"--seeds={text}: give a number of seeds from 1 to 10000, or seeds as in 0,3,7")
     if len(set(numbers)) < len(numbers):
-        raise ConfigError(f"--{flag}={text}: a seed is there twice")
+        raise ConfigError(f"--seeds={text}: a seed is there twice")
     return list(range(numbers[0])) if len(parts) == 1 else numbers
 
 
-def settings(run: Planned, root: str | os.PathLike = "") -> list[str]:
-    """The flags of a run's settings; what it starts from lies under the sweep's root."""
+def settings(run: Planned) -> list[str]:
+    """The flags of a run's settings, for a process that works in the sweep's root."""
     found = [f"--preset={run.preset}"]
     for name, value in run.flags.items():
         values = value if isinstance(value, tuple) else (value,)
         found += [f"--{name}={text}" for text in values or ("none",)]
     sources = {"encoder_from": run.encoder_from, "policy_from": run.policy_from}
-    return found + [f"--{flag}={os.path.join(root, name)}" for flag, name in sources.items() if name]
+    return found + [f"--{flag}={name}" for flag, name in sources.items() if name]
 
 
-def command(run: Planned, root: str | os.PathLike = "") -> list[str]:
-    """The command line of a run; a person may type it.
+def command(run: Planned) -> list[str]:
+    """The command line of a run, for a process that works in the sweep's root; a person may type it there.
 
-    Args:
-        run: of a sweep.
-        root: the sweep's; empty for a process that works there. A sweep's processes do: config.json then
-            names what a run starts from as it lies under the root, wherever that is.
+    config.json then names what a run starts from as it lies under the root, wherever that is.
     """
-    train = [sys.executable, "-m", f"{PACKAGE}.train"]
-    return [*train, *settings(run, root), f"--out={os.path.join(root, run.name)}", "--resume=auto"]
+    return [sys.executable, "-m", f"{PACKAGE}.train", *settings(run), f"--out={run.name}", "--resume=auto"]

@@ -29,15 +29,14 @@ def runs_text(scores: Scores) -> str:
 
 
 def summary(
-    arms: Mapping[str, Mapping[str, Any]], *, baseline: str | None = None, seed: int = 0, **how: Any
+    arms: Mapping[str, Mapping[str, Any]], *, baseline: str | None = None, **how: Any
 ) -> list[dict[str, Any]]:
     """A table of every arm: each number with its interval and the runs behind it; values are JSON's.
 
     Args:
         arms: arm -> game -> raw scores [runs].
         baseline: the arm that all others are compared with; None for none.
-        seed: of the draws; every row starts from it.
-        **how: repetitions and level, see `estimate`.
+        **how: repetitions, level and seed, see `estimate`; the draws of every row start from the seed.
 
     Returns:
         Rows with the keys arm, against (the baseline, or None), game (None: over all games that every arm
@@ -67,7 +66,6 @@ def summary(
         values = dict(zip(Interval._fields, [*numbers, found.kind], strict=True))
         rows.append(row | values | {"runs": runs})
 
-    how["seed"] = seed
     for arm, scores in arms.items():
         theirs = {} if arm == baseline or baseline is None else arms[baseline]
         for game in scores:
