@@ -62,17 +62,11 @@ class Adapter(FrameVectorEnv):
         frame_skip: int = 1,
         max_steps: int = 0,
     ):
-        """Makes the environments.
+        """Makes the environments; for what is not named here see `envs.make` and `games.adapted`.
 
         Args:
             make_one: () -> one environment.
-            num_envs: how many copies, N.
-            seed: the source of all randomness.
-            frame_size: height and width of a frame in pixels; 0 for the environment's own.
-            grey: reduces colours to their luma.
-            render: frames are what the environment renders; its render_mode must be "rgb_array".
-            frame_skip: steps of the environment in an env step, at least 1.
-            max_steps: env steps after which an episode is truncated; 0 leaves that to the environment.
+            frame_size: in pixels; 0 for the environment's own.
 
         Raises:
             ConfigError: an environment cannot be made, its actions are not discrete, or it shows no images; a

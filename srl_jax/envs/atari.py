@@ -65,19 +65,14 @@ class Atari(FrameVectorEnv):
         max_frames: int = MAX_FRAMES,
         reseed_every: int = 5_000,
     ):
-        """Loads the game.
+        """Loads the game; for what is not named here see `envs.make`.
 
         Args:
             game: one of `games.ATARI_57`.
-            num_envs: how many copies, N.
-            seed: the source of all randomness.
-            frame_size: height and width of a frame in pixels.
-            sticky_actions: probability of repeating the last action, per emulator frame.
             full_actions: all 18 actions of the joystick, FIRE among them, instead of those that the game
                 knows.
             noop_max: an episode starts with a random number of no-ops below this (the FIRE counts
                 as one); 0 and 1 mean none.
-            max_frames: emulator frames after which an episode is truncated.
             reseed_every: env steps between two seeded resets of one environment; 0 seeds every
                 reset.
 

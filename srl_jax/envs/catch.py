@@ -74,11 +74,9 @@ class Catch(FrameVectorEnv):
     state_names = STATE
 
     def __init__(self, *, num_envs: int, seed: int, size: int = 84, ball: int = 3, background: str = "none"):
-        """Sets up N games.
+        """Sets up N games; for what is not named here see `envs.make`.
 
         Args:
-            num_envs: how many copies, N.
-            seed: the source of all randomness.
             size: height and width of a frame in pixels, 84 or 42.
             ball: height and width of the ball in pixels of a frame of 84 x 84, at most 12; 3 is that of
                 the game that is called Catch.
