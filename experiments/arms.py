@@ -218,7 +218,7 @@ def read_figure(path: Path) -> Figure:
 
 
 def _flag_text(refuse: Any, number: int, flag: str, value: Any) -> str | tuple[str, ...]:
-    known = {info.flag or name for name, info in INFOS.items()}
+    known = {info.flag or name: info.kind for name, info in INFOS.items()}
     if flag in MOVED:
         raise refuse(f"arm {number}: --{flag} is now {MOVED[flag]}")
     if flag not in known:
@@ -226,6 +226,8 @@ def _flag_text(refuse: Any, number: int, flag: str, value: Any) -> str | tuple[s
         meant = f"did you mean {' or '.join(close)}? " if close else ""
         raise refuse(f"arm {number}: no flag {flag!r}; {meant}srl-jax train --help lists them")
     if isinstance(value, list) and all(isinstance(element, str) for element in value):
+        if len(value) > 1 and known[flag] is not tuple:
+            raise refuse(f"arm {number}: --{flag} is given {len(value)} times; give it once")
         return tuple(value)
     if isinstance(value, bool):
         return "true" if value else "false"

@@ -216,7 +216,10 @@ def compare(values: flags.FlagValues) -> None:
     """
     if not values["runs"].value:
         raise ConfigError("--runs: missing; name two, srl-jax compare runs/a runs/b")
-    roots = list(dict.fromkeys(Path(os.path.expanduser(root)) for root in values["runs"].value))
+    named: dict[Path, Path] = {}  # a run by two names is one
+    for root in map(Path, map(os.path.expanduser, values["runs"].value)):
+        named.setdefault(root.resolve(), root)
+    roots = list(named.values())
     key, out = values["key"].value, values["out"].value
     path = paths.check_file("out", out, ".png", overwrite=values["overwrite"].value) if out else None
     if path and not plots.available():

@@ -153,7 +153,7 @@ def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, 
     A run that is under way, was stopped or killed is left out: it may still get other rows.
 
     Args:
-        root: a run keeps its path below it.
+        root: a run keeps its path below it; where it is a run itself, its name.
         folder: made if it is not there.
         stopped: whether to add runs that were stopped, too: nobody will resume them.
 
@@ -170,7 +170,8 @@ def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, 
     here = read(folder, mend=True) if is_packed(folder) else []
     ready = [run.over or (stopped and run.ended is not None) for run in found]
     whole = added([], itertools.compress(found, ready))
-    runs = added(here, (run._replace(path=folder / run.path.relative_to(root)) for run in whole))
+    above = root.parent if found[0].path == root else root
+    runs = added(here, (run._replace(path=folder / run.path.relative_to(above)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
     left_out = [run.path for run, is_ready in zip(found, ready, strict=True) if not is_ready]

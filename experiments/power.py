@@ -191,9 +191,12 @@ def report(values: flags.FlagValues) -> list[str]:
         rows = [(x.name, x.runs, (x.deviation, x.deviation)) for x in spreads]
         if arms:
             named = {x.name: x for x in spreads}
-            for arm in arms:
-                if arm not in named:
-                    raise ConfigError(f"--arm={arm}: {game}: {choices_text(arm, named)}")
+            if missing := [arm for arm in arms if arm not in named]:
+                error = f"{game}: {choices_text(missing[0], named)}"
+                if not any({*arms} <= {x.name for x in there} for there in found.values()):
+                    raise ConfigError(f"--arm={missing[0]}: {error}")
+                display.say(f"--arm={missing[0]}: left out: {error}")
+                continue
             two = [named[arm] for arm in arms]
             deviations = (two[0].deviation, two[1].deviation)
             rows = [(" and ".join(arms), min(x.runs for x in two), deviations)]

@@ -49,6 +49,8 @@ def check_reach(texts: list[str]) -> dict[str, float]:
     found = {}
     for given in texts:
         game, _, score = given.rpartition("=")
+        if game in found:
+            raise ConfigError(f"--reach={given}: {game} has a score already; give it once")
         try:
             found[game] = float(score)
         except ValueError:

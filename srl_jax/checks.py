@@ -95,17 +95,13 @@ def _has_target(run: Run) -> str:
     return "without RL or an objective that has a slow copy and no views of its own"
 
 
-def _each_of_rl(run: Run) -> str:
-    if not run.config.rl_view.endswith("@each") or _rl_looks(run):
-        return ""
-    return f"with --rl=:view={run.look('rl:view')}, which draws views of a sequence as replay has it"
+def _view_of_rl(run: Run) -> str:
+    own = f"with --rl=:view={run.look('rl:view')}, which draws views of a sequence as replay has it"
+    return "" if _rl_looks(run) else own
 
 
-def _each_of_objectives(run: Run) -> str:
-    known = run.objectives
-    if not run.config.srl_view.endswith("@each") or known is None:
-        return ""
-    looks = any("view" not in spec.resolved for spec in known)
+def _view_of_objectives(run: Run) -> str:
+    looks = run.objectives is None or any("view" not in spec.resolved for spec in run.objectives)
     return "" if looks else "where all objectives draw views of a sequence as replay has it"
 
 
@@ -113,9 +109,19 @@ def _augments(run: Run) -> str:
     config, mode = run.config, MODES[run.config.mode]
     if config.augment == "srl" and (why := _trains_objectives(run)):
         return why
-    rl = config.augment == "all" and mode.rl and not config.rl_view
-    given = " and ".join(f"--{name}" for name in ("rl_view", "srl_view") if getattr(config, name))
-    return "" if rl or mode.representation and not config.srl_view else f"beside {given}"
+    whys = []
+    if mode.representation:
+        whys.append("beside --srl_view" if config.srl_view else _view_of_objectives(run))
+    if mode.rl and config.augment == "all":
+        whys.append("beside --rl_view" if config.rl_view else _view_of_rl(run))
+    return " and ".join(whys) if all(whys) else ""
+
+
+def _target_apart(run: Run) -> str:
+    config = run.config
+    if config.target_encoder == "slow" or config.target_view not in ("same", "none"):
+        return ""
+    return "with --target_encoder=online, where the target is the latent itself"
 
 
 def _heads(run: Run) -> str:
@@ -142,8 +148,9 @@ FACTS: dict[str, Callable[[Run], str]] = {
     "a decoder": _has_decoder,
     "a slow copy": _has_slow_copy,
     "a target": _has_target,
-    "each of RL": _each_of_rl,
-    "each of objectives": _each_of_objectives,
+    "a target apart": _target_apart,
+    "RL has no views of its own": _view_of_rl,
+    "objectives have no views of their own": _view_of_objectives,
     "augments": _augments,
     "heads": _heads,
     "beta changes": _changes("beta", "beta_final"),
@@ -160,8 +167,8 @@ NEEDS = {
          "eval_games", "eval_envs", "eval_max_steps", "final_games", "stop_at_return", "keep_best"), _RL,
     ),
     "augment": "augments",
-    "rl_view": f"{_RL},each of RL",
-    "srl_view": f"{_OBJECTIVES},each of objectives",
+    "rl_view": f"{_RL},RL has no views of its own",
+    "srl_view": f"{_OBJECTIVES},objectives have no views of their own",
     "target_view": "a target",
     "srl_every": f"{_OBJECTIVES},{_RL}",
     "gate": "the encoder may be shared",

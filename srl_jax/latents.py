@@ -62,7 +62,7 @@ def make_losses(
                 objective.head(params[name], read if opens else jax.lax.stop_gradient(read)),
                 objective.head(own["head"], own.get("read", {})),
                 latents if opens else shut(latents),
-                seen.window,
+                window if objective.own_views else seen.window,
                 named_key(key, name),
             )
         return losses, metrics

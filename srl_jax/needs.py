@@ -88,8 +88,8 @@ class Run(NamedTuple):
                     return why
                 continue
             name, sign, text = re.split("(!?=)", part, maxsplit=1)
-            of_row = own is not None and ":" not in name
-            value = own.get(name, UNKNOWN) if own is not None and of_row else self.look(name)
+            of_row = own is not None and name in own
+            value = own[name] if own is not None and of_row else self.look(name)
             if value is UNKNOWN or (value == parse_value(text, type(value))) == (sign == "="):
                 continue
             shown = name if of_row else f"--{name.replace(':', '=:')}"

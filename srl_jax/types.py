@@ -210,6 +210,8 @@ class Objective(NamedTuple):
             parameters, a dict then. Where the mode lets the objective train the encoder, its gradient flows
             into what it reads, whose group an optimizer moves as `srl_jax.learning.update.passes` says;
             elsewhere none does.
+        own_views: its loss draws views of its own, for `Latents.of`, and is handed the window as replay has
+            it, whatever view the run shows other losses.
     """
 
     init: Callable[[jax.Array], Params]
@@ -220,6 +222,7 @@ class Objective(NamedTuple):
     is_decoder: bool = False
     image: Callable[[Params, Latents, Window], tuple[Array, Array]] | None = None
     reads: Mapping[str, Callable[[Params], Params]] = MappingProxyType({})
+    own_views: bool = False
 
     def read(self, params: Mapping[str, Params]) -> dict[str, Params]:
         """{group: the part that it reads} of all parameters."""

@@ -181,9 +181,9 @@ BASES = {
 FLAGS: dict[str, tuple] = {
     # field: (a value, where it is read, where it is not)
     "rl": ("rainbow:hidden=8,n_step=2", ["rl_only"], ["pretrain"]),
-    "augment": ("srl", ["joint"], ["rl_only", "views"]),
-    "rl_view": ("intensity@each", ["rl_only"], ["pretrain", "own views"]),
-    "srl_view": ("intensity@each", ["pretrain"], ["rl_only", "own views"]),
+    "augment": ("srl", ["joint"], ["rl_only", "views", "own views"]),
+    "rl_view": ("intensity", ["rl_only"], ["pretrain", "own views"]),
+    "srl_view": ("intensity", ["pretrain"], ["rl_only", "own views"]),
     "target_view": ("intensity", ["rl_only", "slow pretrain"], ["pretrain", "byol pretrain", "own views"]),
     "srl_every": (2, ["joint"], ["rl_only"]),
     "encoder_optimizer": ("simultaneous", ["joint"], ["rl_only", "srl_stopped", "decoupled"]),
@@ -302,6 +302,35 @@ def test_an_option_of_a_game_changes_something(row):
         assert envs_made(specs.join(row, {**given, option: text})) != envs_made(specs.join(row, given)), (
             option
         )
+
+
+@pytest.mark.parametrize(
+    ("objective", "option", "field"),
+    [
+        ("forward_latent:hidden=8,tau=0.5", "tau", {"target_encoder": "online"}),
+        ("forward_latent:hidden=8,target=periodic,every=3", "every", {"target_encoder": "online"}),
+        ("latent_l2:target=slow", "target", {"target_encoder": "online"}),
+        ("reconstruction:moving=10", "moving", {"frame_stack": 1}),
+    ],
+)
+def test_an_option_may_need_a_flag(objective, option, field):
+    name, options = specs.split(objective)
+    given = [f"{name}:{option}"]
+    resolved(base("rl_only", **with_objectives(objective)), given)
+    config = base("rl_only", **with_objectives(objective), **field)
+    flag, value = next(iter(field.items()))
+    with pytest.raises(
+        ConfigError, match=f"nothing reads {option} with.* --{flag}={value}|without --{flag}="
+    ):
+        resolved(config, given)
+    assert resolved(config, ()) == resolved(
+        base(
+            "rl_only",
+            **with_objectives(specs.join(name, {k: x for k, x in options.items() if k != option})),
+            **field,
+        ),
+        (),
+    )
 
 
 def test_what_a_preset_has_and_nothing_reads_takes_its_default():

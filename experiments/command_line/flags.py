@@ -176,8 +176,11 @@ def with_objectives(base: Sequence[str], given: Sequence[str]) -> tuple[str, ...
             f"--objective={plain}: replaces all, beside --objective={given[signed.index(True)]}"
         )
     found = {text.partition(":")[0].strip(): text for text in base}
-    for text in given:
-        name, sign = text[1:].partition(":")[0].strip(), text[0]
+    names = [text[1:].partition(":")[0].strip() for text in given]
+    for name, text in zip(names, given, strict=True):
+        sign = text[0]
+        if names.count(name) > 1:
+            raise ConfigError(f"--objective={text}: {name} is given {names.count(name)} times; give it once")
         if sign == "+":
             found[name] = text[1:]
         elif name != text[1:].strip() or found.pop(name, None) is None:

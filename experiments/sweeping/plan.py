@@ -100,6 +100,8 @@ def grid(arms: Sequence[Arm], texts: Sequence[str], flags: Flags) -> list[Arm]:
             raise ConfigError(f"--grid={text}: --{flag}: {unknown(flag, known)}")
         if flag in axes or flag in flags:
             raise ConfigError(f"--grid={text}: --{flag} is given beside it; give it once")
+        if twice := next((value for value in values if values.count(value) > 1), None):
+            raise ConfigError(f"--grid={text}: {twice} is given {values.count(twice)} times; give it once")
         axes[flag] = values
     found = []
     for arm in arms:

@@ -359,7 +359,8 @@ class Seeds(NamedTuple):
 def over_seeds(agent: Agent, number: int) -> Seeds:
     """Lifts an agent's functions to an axis of seeds by `jax.vmap`; worth it on an accelerator.
 
-    A seed in company is the same run as alone but for the order of sums in products.
+    A seed in company is the same run as alone but for the order of sums in products, where learning starts
+    behind the first whole window of replay: before it, updates wait until every seed has one.
     """
     if number == 1:
 

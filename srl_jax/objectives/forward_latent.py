@@ -33,7 +33,7 @@ class LatentDynamics(nn.Module):
         return z + step if self.residual else step
 
 
-@needs(tau="target=slow", every="target=periodic")
+@needs(tau="target=slow,target_encoder=slow", every="target=periodic,target_encoder=slow")
 def forward_latent(
     context: Context,
     *,

@@ -77,4 +77,4 @@ def infonce(
         metrics = {"accuracy": masked_mean(found, valid)}
         return info_nce(logits, valid), jax.lax.stop_gradient(metrics)
 
-    return Objective(init, loss, weight, horizon=temporal, slow=ema(tau))
+    return Objective(init, loss, weight, horizon=temporal, slow=ema(tau), own_views=True)

@@ -25,7 +25,7 @@ def l2_norm(z: Array) -> jax.Array:
 NORMS = {"half_squared": half_squared_norm, "l2": l2_norm}
 
 
-@needs(tau="target=slow")
+@needs(target="a target apart", tau="target=slow,target_encoder=slow")
 def latent_l2(
     context: Context,
     *,

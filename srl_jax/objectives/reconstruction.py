@@ -86,7 +86,7 @@ def spectrally_normalised(params: Params) -> Params:
     return jax.tree.map(normalised, params)
 
 
-@needs(patch="masked!=0")
+@needs(patch="masked!=0", moving="frame_stack!=1")
 def reconstruction(
     context: Context,
     *,

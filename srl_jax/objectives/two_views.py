@@ -61,7 +61,7 @@ def byol(
         target = jax.lax.stop_gradient(project(slow_head["projection"], wanted))
         return jnp.mean(jax.vmap(cosine_distance)(prediction, target).reshape(2, -1), 0), {}
 
-    return Objective(init, loss, weight, slow=ema(tau))
+    return Objective(init, loss, weight, slow=ema(tau), own_views=True)
 
 
 def variance_loss(z: Array) -> jax.Array:
@@ -117,7 +117,7 @@ def vicreg(
         losses = invariance * alike + variance * varied + covariance * apart
         return losses, jax.lax.stop_gradient(metrics)
 
-    return Objective(init, loss, weight)
+    return Objective(init, loss, weight, own_views=True)
 
 
 def cross_correlation(z: Array, other: Array) -> Array:
@@ -159,4 +159,4 @@ def barlow(
         total = jnp.sum(factor * (correlation - identity) ** 2)
         return jnp.full(len(first), total), {}
 
-    return Objective(init, loss, weight)
+    return Objective(init, loss, weight, own_views=True)

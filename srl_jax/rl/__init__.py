@@ -170,7 +170,7 @@ def q_learner(
         lagged=slow != "none",
     )  # fmt: skip
     return Algorithm(
-        objective=Objective(learner.init, learner.loss, horizon=n_step),
+        objective=Objective(learner.init, learner.loss, horizon=n_step, own_views=learner.view is not None),
         q_values=learner.q_values,
         alpha=alpha if prioritized else 0.0,
         slow=rules[slow],

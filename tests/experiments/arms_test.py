@@ -92,6 +92,10 @@ def test_a_figure_of_ones_own(tmp_path):
         ),
         ({"arms": [{**GOOD["arms"][0], "flags": {"qqq": 1}}]}, "arm 1: no flag 'qqq'; srl-jax train"),
         (
+            {"arms": [{**GOOD["arms"][0], "flags": {"lr_rl": ["1e-3", "1e-4"]}}]},
+            "arm 1: --lr_rl is given 2 times; give it once",
+        ),
+        (
             {"arms": [{**GOOD["arms"][0], "flags": {"srl_every": None}}]},
             "flag srl_every of arm 1: not a text",
         ),

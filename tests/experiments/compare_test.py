@@ -26,6 +26,8 @@ def runs(tmp_path_factory):
     write_run(root / "pong", (0, 0), game="Pong", frame_size=84)
     write_run(root / "noisy", (0, 0), eps_eval=0.5)
     write_run(root / "failed", (0, 0), ended=NOT_FINITE)
+    write_run(root / "broken", (0, 0), ended=NOT_FINITE)
+    (root / "linked").symlink_to("a")
     rows = [json.loads(line) for line in (root / "c/metrics.jsonl").read_text().splitlines()]
     rows[0] |= {"loss/x": 0.5, "text": "x"}
     (root / "c/metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
@@ -141,14 +143,14 @@ def test_packed_runs_and_folders_of_arms_are_read_alike(runs, tmp_path, capsys):
     [
         ((), "--runs: missing; name two"),
         (("a",), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
-        (("a", "a/"), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
+        (("a", "a/", "linked"), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
         (("a", "nothing"), "nothing: no run directory there"),
         (("a", "b", "--key=eval/return_men"), "no run has it; there are eval/return_mean"),
         (("a", "c", "--key=text"), "c: text is not a number in each row"),
         (("a", "pong"), "of different games, Catch, Pong; --force compares"),
         (("a", "noisy"), "another protocol than .*eps_eval is 0.005 there and 0.5 here; --force"),
         (
-            ("failed", "failed/../failed"),
+            ("failed", "broken"),
             "nothing to draw; Catch, failed: 1 of 1 seed left out: loss/rl is not finite",
         ),
         (("a", "b", "--out=x.jpg"), "--out=x.jpg: must end in .png"),

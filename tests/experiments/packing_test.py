@@ -142,6 +142,13 @@ def test_two_runs_have_two_places(root, tmp_path):
             packing.unpack(tmp_path / "out", tmp_path / "again")
 
 
+def test_a_run_that_is_packed_by_itself_keeps_its_name(tmp_path):
+    for name in "ab":
+        packing.pack(write_run(tmp_path / "runs" / name, ended=Ending("finished", 100)), tmp_path / "out")
+    packing.unpack(tmp_path / "out", tmp_path / "again")
+    assert [run.arm for run in collect.load_runs(tmp_path / "again")] == ["a", "b"]
+
+
 def test_what_packing_did_not_write_is_refused(root, tmp_path):
     out = tmp_path / "out"
     packing.pack(root, out)

@@ -129,8 +129,15 @@ def test_a_run_is_extended_and_says_what_depends_on_its_end(tmp_path, capsys):
     go_on(run, made, longer)
     said = json.loads((run / "config.json").read_text())
     assert Config.load(run) == longer and said["continued"][-1]["settings"] == {"steps": longer.steps}
-    with pytest.raises(ConfigError, match="^--steps=99: the run in .* has done 100 env steps already"):
-        to_resume(run, dataclasses.replace(CONFIG, steps=99))
+    with pytest.raises(ConfigError, match="^--steps=90: the run in .* has done 100 env steps already"):
+        to_resume(run, dataclasses.replace(CONFIG, steps=90))
+    # A run ends with a whole round of its environments.
+    odd = tmp_path / "odd"
+    values = dataclasses.replace(CONFIG, steps=98, num_envs=3)
+    (ended,) = make(odd, values, checkpoints=(99,))
+    assert to_resume(odd, values) == ended
+    with pytest.raises(ConfigError, match="^--steps=96: "):
+        to_resume(odd, dataclasses.replace(values, steps=96))
     # One that has ended without its replay cannot be.
     checkpoint.slim(made)
     assert to_resume(run, longer).files.keys() == {"params.msgpack"}

@@ -77,7 +77,7 @@ def test_the_table_of_a_spread():
     assert _lines("--spread=1", "--effect=1e-3")[1][-2:] == ["over", f"{MOST:,}"]
 
 
-def test_the_spread_of_runs_is_that_of_their_area(tmp_path):
+def test_the_spread_of_runs_is_that_of_their_area(tmp_path, capsys):
     """Areas of a: 0, 1 and 2, SD 1; of b 0, 3 and 6, SD 3; together the root of (1 + 9) / 2."""
     for arm, step in (("a", 1), ("b", 3)):
         for seed in range(3):
@@ -91,6 +91,10 @@ def test_the_spread_of_runs_is_that_of_their_area(tmp_path):
     (_, row) = _lines(f"--from={tmp_path}", "--effect=2", "--arm=b", "--arm=a", "--game=Catch")
     assert row[:7] == ["b", "and", "a", "3", "3", "and", "1"]
     assert row[-1] == str(runs_needed(2, (3, 1)))
+    for seed in range(3):
+        write_run(tmp_path / f"CatchDistractor/a/seed{seed}", (0, seed), seed=seed, game="CatchDistractor")
+    assert len(_lines(f"--from={tmp_path}", "--effect=2", "--arm=b", "--arm=a")) == 2
+    assert "--arm=b: left out: CatchDistractor: " in capsys.readouterr().err
 
 
 def test_runs_are_compared_as_in_figures_and_what_is_left_out_is_said(tmp_path, capsys):

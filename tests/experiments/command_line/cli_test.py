@@ -149,6 +149,7 @@ BAD = [
     (["--config=no/such"], "--config=no/such", "give a run's config.json"),
     (["--config=pyproject.toml"], "--config=pyproject.toml", "not JSON"),
     ([*JOINT, "--objective=+inverse"], "--objective=reconstruction", "replaces all"),
+    (["--preset=catch/joint", *["--objective=+inverse"] * 2], "inverse is given 2 times", "give it once"),
     (["--preset=catch/joint", "--objective=-inverse"], "--objective=-inverse", "reconstruction, latent_l2"),
     (["--import=no_such.py"], "--import=", "no such file"),
     (["--reward_clip=maybe"], "--reward_clip=maybe", "true or false"),

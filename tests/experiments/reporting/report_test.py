@@ -367,6 +367,10 @@ def test_the_command_line(monkeypatch, tmp_path, capsys):
         ([".", "--out=a.html"], "no run directory"),
         ([".", "--out=a.html", "--reach=Pong"], "must be GAME=SCORE"),
         ([".", "--out=a.html", "--reach=Pong=nan"], "must be GAME=SCORE"),
+        (
+            [".", "--out=a.html", "--reach=Pong=0", "--reach=Pong=1"],
+            "--reach=Pong=1: Pong has a score already",
+        ),
         (["{runs}", "--out=a.html", "--reach=Pong=1"], "--reach=Pong: no run of that game; valid: Catch"),
         (
             ["{runs}", "--out=a.html", "--baseline=x"],

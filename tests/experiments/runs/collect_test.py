@@ -75,6 +75,7 @@ def test_a_run_that_failed_is_neither_compared_nor_under_way(tmp_path):
     write_run(tmp_path / "b/seed1", (0, 1), seed=1, ended=Ending("stopped", 100))
     write_run(tmp_path / "b/seed2", (0,), seed=2)
     write_run(tmp_path / "b/seed3", (), seed=3)
+    write_run(tmp_path / "b/seed4", (0,), seed=4, ended=Ending("finished", 9))
     write_run(tmp_path / "c/seed0", (), mode="pretrain")
     runs = collect.load_runs(tmp_path)
     assert [(run.arm, run.seed) for run in collect.comparable(runs)] == [("a", 0), ("b", 0), ("b", 1)]
@@ -84,6 +85,7 @@ def test_a_run_that_failed_is_neither_compared_nor_under_way(tmp_path):
         ("a", 2): NOT_FINITE.reason,
         ("b", 2): "has only begun",
         ("b", 3): "not evaluated yet",
+        ("b", 4): "has a single evaluation",
     }
     # One that failed says nothing of how far the others of its game are.
     alone = [run for run in runs if run.seed == 2]

@@ -194,6 +194,7 @@ def test_a_grid_is_an_arm_for_each_combination():
         (["lr_rl"], "must be FLAG=VALUE,VALUE"),
         (["=1"], "must be FLAG=VALUE,VALUE"),
         (["lr_rl=1,,2"], "must be FLAG=VALUE,VALUE"),
+        (["lr_rl=1e-3,1e-3"], "1e-3 is given 2 times; give it once"),
         (["lr=1,2"], "--lr: no such flag; did you mean --lr_encoder"),
         (["n_step=1,2"], "--n_step: is now --rl=:n_step"),
         (["gamma=0.9", "gamma=0.99"], "--gamma is given beside it"),
