@@ -33,6 +33,7 @@ from srl_jax.files.resuming import (
     say_finished,
 )
 from srl_jax.files.rundir import LOCK, check_free, put_back, run_directory
+from srl_jax.learning.modes import MODES
 from srl_jax.training import check_game, check_sources, completed, resolved
 
 from .command_line import flags as config_flags
@@ -166,6 +167,14 @@ def say_unused(values: flags.FlagValues, game: str) -> None:
             display.say(f"--{name}: changes nothing, {game} has none")
 
 
+def say_last_evaluation(config: Config) -> None:
+    """A line where the last evaluation of the learning curve is not at the end."""
+    end, every = -(-config.steps // config.num_envs) * config.num_envs, config.eval_every
+    last = end // every * every
+    if MODES[config.mode].rl and not config.final_games and end - last >= config.num_envs:
+        display.say(f"--eval_every={every}: the last evaluation is after {last:,} of {end:,} env steps")
+
+
 def check_paths(config: Config) -> None:
     """Whether the paths that the run starts from exist.
 
@@ -256,6 +265,8 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
         started = contextlib.ExitStack()  # what is to be done once the run has begun
+        if not manifests[0]:
+            started.callback(say_last_evaluation, config)
         if seeds and fresh:
             started.callback(stack.enter_context(run_directory(path, None)))
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):

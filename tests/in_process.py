@@ -18,7 +18,7 @@ from srl_jax.files import checkpoint
 
 ROOT = pathlib.Path(__file__).resolve().parents[1]
 CATCH = ["--game=Catch", "--encoder=tiny", "--frame_size=42", "--steps=500", "--checkpoint_every=100"]
-CATCH += ["--nodiagnostics"]
+CATCH += ["--eval_every=500", "--nodiagnostics"]
 
 
 class Loop(types.ModuleType):

@@ -373,6 +373,21 @@ def test_a_flag_that_a_game_has_no_use_for_is_named(capsys, loop, tmp_path):
     assert "changes nothing" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("flags", "last"),
+    [
+        (["--steps=700", "--eval_every=500"], "500 of 700"),
+        (["--steps=90", "--eval_every=100"], "0 of 90"),
+        (["--steps=1000", "--eval_every=500"], ""),
+        (["--steps=95", "--eval_every=100"], ""),  # a round of ten environments ends at 100
+        (["--steps=700", "--eval_every=500", "--final_games=3"], ""),
+    ],
+)
+def test_a_last_evaluation_before_the_end_is_said(capsys, loop, tmp_path, flags, last):
+    train_in_process("--preset=catch/rl_only", *flags, f"--out={tmp_path}/a")
+    assert (f"the last evaluation is after {last} env steps" in capsys.readouterr().err) == bool(last)
+
+
 def test_a_game_that_cannot_be_made_leaves_nothing(capsys, loop, tmp_path):
     with pytest.raises(SystemExit):
         train_in_process("--game=nonesuch_module:E-v0", f"--out={tmp_path}/a")
