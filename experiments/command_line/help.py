@@ -114,7 +114,7 @@ def _listed(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
         for other in list(rows)[:place]:
             if options and rows[other].keys() == options.keys():
                 differing = {key: x for key, x in options.items() if x != rows[other][key]}
-                line = f"{name}: {specs.join(other, differing)}"
+                line = f"{name}: as {specs.join(other, differing)}"
                 break
         broken = textwrap.wrap(line.replace(",", ", "), 80, subsequent_indent="    ")
         yield from (_INDENT + part.replace(", ", ",") for part in broken)

@@ -174,6 +174,9 @@ class Report:
         self.eval_row(env_steps, updates, row | dict(values), kind)
         what = "final evaluation" if kind == "final" else "evaluation"
         took = f"{games} games, {seconds:.1f} s"
+        most = self._config.eval_max_steps
+        if cut := sum(length >= most for length in played.lengths):
+            took += f", {cut} of them cut at {most} env steps"
         self.progress.note(f"{what} after {env_steps} env steps: mean return {mean:.2f} over {took}")
         return mean
 

@@ -12,6 +12,7 @@ from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.learning.optim import NOT_MEASURED
 from srl_jax.run import reporting
+from srl_jax.run.evaluate import Evaluation
 from srl_jax.run.reporting import Means, Report
 
 
@@ -213,3 +214,14 @@ def test_what_cannot_be_flushed_is_a_save_error(tmp_path, monkeypatch):
         monkeypatch.setattr("os.fsync", full)
         with pytest.raises(SaveError, match="metrics.jsonl: not flushed: No space left"):
             one.snapshot()
+
+
+def test_an_evaluation_says_how_many_games_were_cut(tmp_path, monkeypatch):
+    report = Report(tmp_path, Config(eval_max_steps=9), progress=False)
+    said = []
+    monkeypatch.setattr(report.progress, "note", said.append)
+    with report:
+        for lengths in ([8, 3], [9, 3]):
+            report.evaluation("eval", 0, 0, Evaluation([1.0, 3.0], lengths, None), 2.0, {})
+    assert said[0] == "evaluation after 0 env steps: mean return 2.00 over 2 games, 2.0 s"
+    assert said[1] == said[0] + ", 1 of them cut at 9 env steps"
