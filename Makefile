@@ -24,7 +24,7 @@ FAST := augment config data/data diagnostics/measures envs/base experiments/arms
 	experiments/drawing/colours experiments/drawing/plots experiments/protocols \
 	experiments/runs/run_data experiments/sweeping/plan experiments/sweeping/status files/metrics \
 	files/reading files/rundir learning/optim project/api_docs project/docs replay/machine replay/replay \
-	replay/sumtree rl/losses run/actor run/ending specs statistics/statistics window
+	replay/sumtree rl/losses run/actor run/ending specs statistics/curves statistics/statistics window
 
 .DEFAULT_GOAL := help
 .PHONY: help install check test train lint docs soak bench bench-gpu bench-install answers
