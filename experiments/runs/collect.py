@@ -231,7 +231,7 @@ def _why_not(runs: Sequence[RunData], key: str) -> list[str]:
         elif count == 0:
             why = "not evaluated yet" if key == RETURN else f"has no {key}"
         elif count == 1 and run.game in under_way:
-            why = "has a single evaluation" if run.over else "has only begun"
+            why = "has only begun" if run.ended is None else "has a single evaluation"
         found.append(why)
     return found
 
