@@ -64,7 +64,7 @@ docs: install ## write the API reference, build/docs/index.html
 lint: install ## check style and formatting
 	@$(VENV)/bin/python -m ruff check . && $(VENV)/bin/python -m ruff format --check .
 
-answers: install ## draw every figure and compute every number of docs/answers.md again (ten minutes)
+answers: install ## draw every figure and compute every number of docs/answers.md again (twelve minutes)
 	@$(VENV)/bin/python -m experiments.analyses.answers $(ARGS)
 
 soak: install ## try to break what is promised about killed runs, disks, inputs and combinations (2.5 hours)

@@ -169,7 +169,7 @@ def say_unused(values: flags.FlagValues, game: str) -> None:
 
 def say_last_evaluation(config: Config) -> None:
     """A line where the last evaluation of the learning curve is not at the end."""
-    end, every = -(-config.steps // config.num_envs) * config.num_envs, config.eval_every
+    end, every = config.whole_rounds(config.steps), config.eval_every
     last = end // every * every
     if MODES[config.mode].rl and not config.final_games and end - last >= config.num_envs:
         display.say(f"--eval_every={every}: the last evaluation is after {last:,} of {end:,} env steps")

@@ -343,6 +343,10 @@ class Config:
         """Reads config.json of a run directory; raises as `read`."""
         return read(run)[0]
 
+    def whole_rounds(self, env_steps: int) -> int:
+        """The first env step not before this one that ends a round of the training environments."""
+        return -(-env_steps // self.num_envs) * self.num_envs
+
     def save(self, run: str | Path) -> None:
         """Writes a run's config.json: the fields, what made the run, and when it began (UTC)."""
         write(

@@ -211,7 +211,8 @@ class Objective(NamedTuple):
             into what it reads, whose group an optimizer moves as `srl_jax.learning.update.passes` says;
             elsewhere none does.
         own_views: its loss draws views of its own, for `Latents.of`, and is handed the window as replay has
-            it, whatever view the run shows other losses.
+            it, whatever view the run shows other losses. Its row has an option `view`, by which it is known
+            that no flag's view is read.
     """
 
     init: Callable[[jax.Array], Params]

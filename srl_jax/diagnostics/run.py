@@ -208,7 +208,7 @@ def kept_steps(config: Config) -> tuple[int, ...]:
     number = min(config.diagnostics_kept, evaluations)
     indices = {i * evaluations // number for i in range(number)}
     # The loop evaluates after the first step that reaches a multiple.
-    return tuple(sorted(-(-i * config.eval_every // config.num_envs) * config.num_envs for i in indices))
+    return tuple(sorted(config.whole_rounds(i * config.eval_every) for i in indices))
 
 
 def _plain(value: Any) -> Any:

@@ -140,8 +140,7 @@ def to_resume(
                 "and left no replay to resume with; --keep_replay beside training keeps it"
             )
         return manifest
-    rounds = -(-wanted.steps // wanted.num_envs)  # a run ends with a whole one
-    if rounds * wanted.num_envs < manifest.env_steps:
+    if wanted.whole_rounds(wanted.steps) < manifest.env_steps:
         raise ConfigError(
             f"--steps={wanted.steps}: the run in {path} has done {manifest.env_steps} env steps already"
         )

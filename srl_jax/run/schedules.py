@@ -87,7 +87,7 @@ class Schedules:
         c, number = self._config, self.resets(env_steps)
         if not number:
             return updates
-        begins = -(-number * c.reset_every // c.num_envs) * c.num_envs  # the step that started with it
+        begins = c.whole_rounds(number * c.reset_every)  # the step that started with it
         return max(0, updates - self.updates_due(begins - c.num_envs))
 
     def row(self, env_steps: int, updates: int) -> dict[str, Any]:

@@ -279,6 +279,13 @@ def test_pictures_are_pairs_of_images(name):
 
 
 @every_row
+def test_who_has_views_of_its_own_has_an_option_that_says_which(kind, name):
+    registry = {"objectives": objectives.REGISTRY, "rl": rl.REGISTRY}[kind]
+    view = specs.option_defaults(registry[name]).get("view", "none")
+    assert build(kind, name).objective.own_views == (view != "none")
+
+
+@every_row
 def test_decoder_heads_say_so(kind, name):
     # Decoder weight decay reaches what is marked; what draws the pictures is a decoder.
     row = build(kind, name)
