@@ -28,14 +28,8 @@ def run(path, preset, **overrides):
 
 
 def test_joint(tmp_path):
-    rows, final = run(tmp_path / "joint", "catch/joint", batch_size=32)  # half the preset's, to save time
+    # Half the preset's batch and half its frame, which is a third of the time.
+    rows, final = run(tmp_path / "joint", "catch/joint", batch_size=32, frame_size=42)
     assert final > -0.2
     losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
     assert losses[-1] < 0.6 * losses[0]
-
-
-def test_pretrain(tmp_path):
-    rows, _ = run(tmp_path / "pretrain", "catch/pretrain", steps=8_000)
-    losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
-    # A black image has 0.0051. One that shows the paddle and no ball is near 0.0018: 3 of 16 pixels.
-    assert losses[-1] < 0.0018 and losses[-1] < losses[3] < losses[0]

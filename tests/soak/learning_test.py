@@ -28,3 +28,10 @@ def test_on_the_encoder_of_an_rl_run(rl_only, tmp_path, mode):
         short["lr_srl"] = 3e-5
     _, final = run(tmp_path / mode, f"catch/{mode}", encoder_from=str(source), **short)
     assert final > -0.45
+
+
+def test_pretrain(tmp_path):
+    rows, _ = run(tmp_path / "pretrain", "catch/pretrain", steps=8_000)
+    losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
+    # A black image has 0.0051. One that shows the paddle and no ball is near 0.0018: 3 of 16 pixels.
+    assert losses[-1] < 0.0018 and losses[-1] < losses[3] < losses[0]
