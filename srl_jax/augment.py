@@ -174,8 +174,9 @@ class Views(NamedTuple):
     Attributes:
         rl: what RL sees.
         srl: what the representation objectives see.
-        target: under the slow encoders, and what RL sees of s_{t+n}: "same" for the view of the loss itself,
-            by the same draw, or a view with a draw of its own that all losses share.
+        target: under the slow encoders, or the online one where it stands for them (`target=stopped`), and
+            what RL sees of s_{t+n}: "same" for the view of the loss itself, by the same draw, or a view with
+            a draw of its own that all losses share.
     """
 
     rl: str = "none"

@@ -90,9 +90,10 @@ def _rl_looks(run: Run) -> bool:
 
 def _has_target(run: Run) -> str:
     mode = MODES[run.config.mode]
-    if _rl_looks(run) or mode.representation and _slow(run, own_views=False):
+    stopped = any(spec.resolved.get("target") == "stopped" for spec in run.objectives or ())
+    if _rl_looks(run) or mode.representation and (stopped or _slow(run, own_views=False)):
         return ""
-    return "without RL or an objective that has a slow copy and no views of its own"
+    return "without RL or an objective that has later latents as its target and no views of its own"
 
 
 def _view_of_rl(run: Run) -> str:

@@ -90,7 +90,7 @@ class Config:
     )
     target_view: str = _value(
         str, "same",
-        "what slow encoders see, and RL of s_{t+n}, likewise, by a draw of their own; same: each loss's view",
+        "what targets see: slow encoders, and RL of s_{t+n}; by a draw of their own; same: each loss's view",
     )  # fmt: skip
     srl_every: int = _value(
         int, 1, "representation losses are computed in every k-th update", "updates", minimum=1

@@ -77,9 +77,7 @@ def forward_latent(
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         ahead = [k + 1 for k in range(steps)]
-        targets = latents.slow(ahead) if rule else latents.online(ahead)
-        if target == "stopped":
-            targets = jax.lax.stop_gradient(targets)
+        targets = latents.online(ahead) if target == "gradient" else latents.slow(ahead)
         z = latents.online(0)
         losses: Array = jnp.zeros(len(z), jnp.float32)
         for k in range(steps):

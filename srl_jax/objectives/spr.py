@@ -97,8 +97,8 @@ def spr(
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         ahead = [k + 1 for k in range(steps)]
-        behind = (latents.slow(ahead), slow_head) if target == "slow" else (latents.online(ahead), head)
-        targets, below = jax.lax.stop_gradient(behind)
+        below = slow_head if target == "slow" else jax.lax.stop_gradient(head)
+        targets = latents.slow(ahead)
         predicted = [min_max(latents.online(0))]
         for k in range(steps):
             action = one_hot(window.actions[:, k], context.num_actions)

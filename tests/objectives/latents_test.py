@@ -76,7 +76,7 @@ def test_forward_latent_against_numpy(target):
     window = make_window(horizon=2)
     window.valid[1, 1] = 0
     losses, head, _ = loss_of(objective, latents_of(z, slow), window)
-    head, goal = head["MLP_0"], z if target == "stopped" else slow
+    head, goal = head["MLP_0"], slow  # of `stopped`: the online encoder's, as the target view has them
     first = z[0] + by_numpy(head, z[0], window.actions[:, 0])
     second = first + by_numpy(head, first, window.actions[:, 1])
     errors = [((p - g) ** 2).mean(-1) for p, g in ((first, goal[1]), (second, goal[2]))]

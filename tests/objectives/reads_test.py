@@ -82,7 +82,7 @@ def test_spr_by_the_first_layer_of_rl_against_numpy(target, options, layers):
         maps = np.maximum(linear(own["transition"]["first"], x), 0)
         state = scaled(np.maximum(linear(own["transition"]["second"], maps), 0))
         y = linear(own["predictor"], project(of_rl, state))
-        goal = project(lagged, scaled(slow[k + 1])) if target == "slow" else project(of_rl, scaled(z[k + 1]))
+        goal = project(lagged if target == "slow" else of_rl, scaled(slow[k + 1]))
         cosine = (y * goal).sum(-1) / np.linalg.norm(y, axis=-1) / np.linalg.norm(goal, axis=-1)
         total += window.valid[:, k] * (2 - 2 * cosine)
     np.testing.assert_allclose(losses, total / STEPS, rtol=1e-4, atol=1e-5)
