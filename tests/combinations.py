@@ -77,7 +77,8 @@ SETTINGS = {
 """{field of Config: what is drawn, one time in ten}."""
 
 NEEDED = {
-    "munchausen": {"double": False}, "target=s_t+n-1": {"n_step": 2}, "init_std": {"init_std": 1.0},
+    "munchausen": {"double": False}, "init_std": {"init_std": 1.0},
+    **{f"target={name}": {"n_step": 2} for name in list(rl.N_STEP_VIEWS)[1:]},
 }  # fmt: skip
 """{an option, or one of its values: what it needs beside it}; refused without."""
 

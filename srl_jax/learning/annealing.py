@@ -109,5 +109,5 @@ def check_n(text: str, rl: Spec) -> None:
         raise ConfigError(
             f"--n_anneal={text}: --rl has n_step={found}; give --rl=:n_step={largest}, the larger n"
         )
-    if rl.resolved.get("target") == "s_t+n-1" and smallest < 2:
-        raise ConfigError(f"--n_anneal={text}: with --rl=:target=s_t+n-1 n is at least 2")
+    if (target := rl.resolved.get("target", "s_t+n")) != "s_t+n" and smallest < 2:
+        raise ConfigError(f"--n_anneal={text}: with --rl=:target={target} n is at least 2")

@@ -13,7 +13,7 @@ from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
 from srl_jax.rl.learner import Munchausen, QLearner
 from srl_jax.rl.losses import n_step as n_step_view
-from srl_jax.rl.losses import n_step_one_early
+from srl_jax.rl.losses import n_step_end_unnoticed, n_step_one_early, n_step_one_reward
 from srl_jax.rl.values import Values, categorical, implicit_quantile, normal_logits, quantile, scalar
 from srl_jax.specs import check_choice, check_size, needs, needs_of, option_defaults
 from srl_jax.types import Array, Context, Layer, Objective, Params
@@ -21,8 +21,13 @@ from srl_jax.types import Array, Context, Layer, Objective, Params
 __all__ = ["REGISTRY", "register", "Algorithm", "Values", "normal_logits", "q_learner", "rainbow"]
 
 SLOW, ACTORS = ("periodic", "ema", "none"), ("online", "slow")
-N_STEP_VIEWS = {"s_t+n": n_step_view, "s_t+n-1": n_step_one_early}
-"""Where a target bootstraps from, by name; the second is a defect."""
+N_STEP_VIEWS = {
+    "s_t+n": n_step_view,
+    "s_t+n-1": n_step_one_early,
+    "one_reward": n_step_one_reward,
+    "end_unnoticed": n_step_end_unnoticed,
+}
+"""What a target is made of, by name; all but the first are defects of public codes."""
 
 Rule: TypeAlias = Callable[[Params, Params, Array], Params]
 """How a slow copy follows, as of `srl_jax.types.Objective.slow`."""
@@ -121,8 +126,8 @@ def q_learner(
             take their place.
         slow_tau: of the moving average, the share that stays in an update, see `srl_jax.learning.update.ema`.
         act_with: whether the "online" or the "slow" network acts, in training and in evaluations.
-        target: the state bootstrapped from; "s_t+n-1" is a defect of the buffers of Dopamine's Atari 100k
-            agents and of BBF, see `srl_jax.rl.losses.n_step_one_early` and docs/deviations.md.
+        target: what it is made of, `N_STEP_VIEWS`: n rewards and s_{t+n}, or a defect of public codes, see
+            docs/deviations.md.
 
     Raises:
         ValueError: where a number is out of range, a choice is unknown, or two options do not go together.
@@ -144,8 +149,8 @@ def q_learner(
         raise ValueError("munchausen_tau must be above 0 and munchausen_clip at most 0")
     if act_with == "slow" and slow == "none":
         raise ValueError("act_with=slow needs a slow network; slow=none has none")
-    if target == "s_t+n-1" and n_step < 2:
-        raise ValueError("target=s_t+n-1 needs n_step of at least 2; with 1 it would bootstrap from s_t")
+    if target != "s_t+n" and n_step < 2:
+        raise ValueError(f"target={target} needs n_step of at least 2")
     if slow == "ema":
         ema(slow_tau)  # raises where it is out of range
     rules: dict[str, Callable[[int], Rule | None]] = {

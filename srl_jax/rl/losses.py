@@ -228,23 +228,37 @@ def n_step(
     return r_t, discount_t, jnp.sum(valid[..., :n], -1).astype(jnp.int32)
 
 
+def n_step_end_unnoticed(
+    rewards: Array, discounts: Array, valid: Array, n: int | Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The n-step view as the buffer of the code of Nikishin et al. (2022) has it; a defect.
+
+    It is `n_step`, but it is not noticed that the last of the n steps ended in a terminal state.
+
+    Args:
+        rewards, discounts, valid: see `n_step`.
+        n: steps, at least 2.
+    """
+    before = jnp.concatenate([discounts[..., :1], discounts[..., :-1]], -1)
+    last = jnp.arange(discounts.shape[-1]) == jnp.asarray(n)[..., None] - 1
+    unnoticed = jnp.where(last, before, discounts)
+    return n_step(rewards, unnoticed, valid, n)
+
+
 def n_step_one_early(
     rewards: Array, discounts: Array, valid: Array, n: int | Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The n-step view as the buffers of Dopamine's Atari 100k agents and of BBF have it; a defect.
 
-    The n rewards and the discount are `n_step`'s, but the state bootstrapped from is one step earlier, and
-    it is not noticed that the last of the n steps ended in a terminal state.
-
-    Args:
-        rewards, discounts, valid: see `n_step`.
-        n: steps, at least 2.
-
-    Returns:
-        As `n_step`; offset is 0..n - 1.
+    It is `n_step_end_unnoticed`, and the state bootstrapped from is one step earlier: offset is 0..n - 1.
     """
-    before = jnp.concatenate([discounts[..., :1], discounts[..., :-1]], -1)
-    last = jnp.arange(discounts.shape[-1]) == jnp.asarray(n)[..., None] - 1
-    unnoticed = jnp.where(last, before, discounts)
-    r_t, discount_t, offset = n_step(rewards, unnoticed, valid, n)
+    r_t, discount_t, offset = n_step_end_unnoticed(rewards, discounts, valid, n)
     return r_t, discount_t, offset - 1
+
+
+def n_step_one_reward(
+    rewards: Array, discounts: Array, valid: Array, n: int | Array
+) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """The n-step view of SPR in Dopamine's Atari 100k lab: `n_step_one_early` of the first reward alone."""
+    _, discount_t, offset = n_step_one_early(rewards, discounts, valid, n)
+    return rewards[..., 0], discount_t, offset

@@ -16,7 +16,9 @@ from srl_jax.rl.losses import (
     huber,
     munchausen_return,
     n_step,
+    n_step_end_unnoticed,
     n_step_one_early,
+    n_step_one_reward,
     q_learning,
     quantile_q_learning,
     soft_policy,
@@ -336,14 +338,19 @@ def test_n_step_by_hand():
     assert int(offset[0]) == 3 and int(offset[2]) == 2
 
 
-def test_n_step_one_early_by_hand():
+def test_the_defects_of_public_codes_by_hand():
     # gamma 0.5, rewards 1, 2, 4, n = 3. Going on, and a terminal state after the third step, which is not
     # noticed: 3, and s_{t+2} with 0.125. After the second it is: 2, no bootstrap. Truncated after the second:
     # 2, and s_{t+1} with 0.25.
     rewards = np.array([[1, 2, 4], [1, 2, 4], [1, 2, 0], [1, 2, 0]], np.float32)
     discounts = np.array([[0.5] * 3, [0.5, 0.5, 0], [0.5, 0, 0], [0.5, 0.5, 0]], np.float32)
     valid = np.array([[1, 1, 1], [1, 1, 1], [1, 1, 0], [1, 1, 0]], np.float32)
-    r_t, discount_t, offset = jax.jit(partial(n_step_one_early, n=3))(rewards, discounts, valid)
-    np.testing.assert_array_equal(r_t, [3, 3, 2, 2])
-    np.testing.assert_array_equal(discount_t, [0.125, 0.125, 0, 0.25])
-    np.testing.assert_array_equal(offset[np.array([0, 1, 3])], [2, 2, 1])
+    views = (n_step_one_early, n_step_one_reward, n_step_end_unnoticed)
+    rows = jax.jit(lambda *window: [view(*window, 3) for view in views])(rewards, discounts, valid)
+    # SPR in Dopamine has the first reward alone; the third view has the right state.
+    for (r_t, discount_t, offset), wanted, late in zip(
+        rows, ([3, 3, 2, 2], [1] * 4, [3, 3, 2, 2]), (0, 0, 1), strict=True
+    ):
+        np.testing.assert_array_equal(r_t, wanted)
+        np.testing.assert_array_equal(discount_t, [0.125, 0.125, 0, 0.25])
+        np.testing.assert_array_equal(offset[np.array([0, 1, 3])] - late, [2, 2, 1])

@@ -368,7 +368,7 @@ def test_the_value_distribution_starts_as_wide_as_asked(dueling, init_std, expec
         ({"slow": "none", "act_with": "slow"}, "act_with=slow needs a slow network; slow=none has none"),
         ({"act_with": "fast"}, "act_with: .*valid: online, slow"),
         ({"target": "s_t"}, "target: .*valid: s_t.n, s_t.n-1"),
-        ({"target": "s_t+n-1", "n_step": 1}, "target=s_t.n-1 needs n_step of at least 2"),
+        ({"target": "s_t+n-1", "n_step": 1}, "target=s_t.n-1 needs n_step of at least 2$"),
         ({"alpha": 1.5}, "alpha must be at most 1"),
         ({"hidden": 2**16 + 1}, "hidden must be at least 1 and at most 65536"),
         ({"atoms": 2**31 - 1}, "atoms must be at least 2 and at most 65536"),
