@@ -77,7 +77,11 @@ def crop_pad_crop(frames: Array, key: Array, cut: int = 4, pad: int = 4) -> Arra
     return frames
 
 
-VIEWS = Registry("augment", {"shift": random_shift, "intensity": intensity, "crop_pad_crop": crop_pad_crop})
+VIEWS = Registry(
+    "augment",
+    {"shift": random_shift, "intensity": intensity, "crop_pad_crop": crop_pad_crop},
+    reserved=("none", "same"),
+)
 """{name: (frames [T, H, W, C], key) -> frames}: the parts of a view, as in `shift+intensity`."""
 register = VIEWS.register
 

@@ -246,6 +246,12 @@ def check(
             f"--objective: --mode={mode.name} needs at least one, for example "
             "--objective=reconstruction:weight=1"
         )
+    if config.whole_rounds(config.steps) * config.updates_per_step >= 2**31:
+        rate = specs.value_text(config.updates_per_step)
+        raise ConfigError(
+            f"--steps={config.steps}: with --updates_per_step={rate} that is 2^31 updates or more, which an "
+            "int32 does not count; give fewer"
+        )
     run_of(config).refuse(given)
     config = run_of(config).in_force()
     annealing.check(config, mode)

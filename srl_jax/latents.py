@@ -126,8 +126,9 @@ def encoded(
 ) -> Callable[[Offsets], jax.Array]:
     """offset -> latents, list of offsets -> latents of each: what `Latents` says of one encoder.
 
-    With a key they are those of `Encoder.train`, where there is one. What an offset's noise is does not
-    depend on what else is asked for; offsets that are not known when they are traced share theirs.
+    With a key they are those of `Encoder.train`, where there is one. What the noise of an offset, or of a
+    list of offsets, is does not depend on what else is asked for; an offset that is asked for alone and the
+    same one in a list have draws of their own, and offsets that are not known when they are traced share one.
     """
 
     def apply(observations: jax.Array, asked: Sequence[int | Array]) -> jax.Array:

@@ -171,6 +171,9 @@ class Weight(float):
     def __eq__(self, other: object) -> bool:
         return repr(self) == repr(other)
 
+    def __ne__(self, other: object) -> bool:  # float has its own
+        return not self == other
+
     __hash__ = float.__hash__
 
 

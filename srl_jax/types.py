@@ -195,8 +195,8 @@ class Objective(NamedTuple):
 
     Attributes:
         init: key -> head parameters (may be an empty dict).
-        loss: (head, slow_head, latents, window, key) -> (losses [B], metrics: dict of scalars, or of [B]
-            arrays for `td_error`).
+        loss: (head, slow_head, latents, window, key) -> (losses [B], metrics: dict of scalars, or of an
+            array for `td_error`, see `srl_jax.rl.Algorithm`).
         weight: the factor of its batch mean in the sum of a pass; a `srl_jax.specs.Weight` is a schedule of
             it, or a ratio of gradients. A factory passes on what it is given.
         horizon: how many steps after s_t it reads.

@@ -312,6 +312,13 @@ def test_settings_that_a_mode_ignores_are_refused(values, message):
     assert "\n" not in str(error.value)
 
 
+def test_updates_that_int32_does_not_count_are_refused():
+    most = Config(steps=2**31 - 1, num_envs=1, updates_per_step=1.0)
+    assert checks.check(most) == most
+    with pytest.raises(ConfigError, match="^--steps=2147483647: with --updates_per_step=1.5 that is"):
+        checks.check(dataclasses.replace(most, updates_per_step=1.5))
+
+
 def test_an_encoder_may_be_needed_beyond_the_mode_or_not_be_asked_for():
     joint = Config(mode="joint", objectives=("first",))
     with pytest.raises(ConfigError, match="needs --encoder_from=PATH; make one$"):

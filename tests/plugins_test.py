@@ -87,6 +87,13 @@ def test_a_name_is_registered_once(registry, tmp_path):
     assert registry["a"] is again
 
 
+@pytest.mark.parametrize("name", ["rl", "encoder", "encoder_srl", "rl_srl", "none"])
+def test_an_objective_takes_no_name_of_the_agents_own(name):
+    with pytest.raises(ConfigError, match=f"registers '{name}' in srl_jax.objectives, where the package"):
+        objectives.register(name, _row)
+    assert name not in objectives.REGISTRY
+
+
 @pytest.mark.parametrize("name", ["", "a:b", "a,b", "a=1", "a b", "ä", 3])
 def test_a_name_can_be_written_in_a_specification(registry, name):
     with pytest.raises(ConfigError, match="a name is letters, digits and _"):

@@ -40,6 +40,7 @@ def blank(path: Path) -> bool:
         return True
     begun, rows = _is_config(path / config.FILE), path / "metrics.jsonl"
     unwritten = begun and rows.is_file() and not rows.stat().st_size
+    without_rows = (config.FILE, ending.FILE) if unwritten or not rows.exists() else (config.FILE,)
 
     def left(entry: Path) -> bool:
         if entry.name.startswith("seed") and entry.is_dir() and not entry.is_symlink():
@@ -52,7 +53,7 @@ def blank(path: Path) -> bool:
             return unwritten and all(kept.name == f"{0:09d}" for kept in _finished(entry))
         if entry.name == "checkpoints":
             return unwritten and not _finished(entry)
-        return entry.name == config.FILE or (unwritten and entry.name in ("metrics.jsonl", *loggers.WRITTEN))
+        return entry.name in without_rows or (unwritten and entry.name in ("metrics.jsonl", *loggers.WRITTEN))
 
     return all(left(entry) for entry in path.iterdir())
 

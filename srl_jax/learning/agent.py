@@ -340,7 +340,7 @@ class Seeds(NamedTuple):
         update, update_rl: (TrainState, [Window] of the seeds, Hyper) -> (TrainState, td_error, metrics).
         norms: (TrainState, [Window], Hyper) -> `TrainState.norms`, or None; as the agent's.
         follow: TrainState -> TrainState.
-        act: (params, [frames uint8 [N, S, H, W]], [key], step, epsilon) -> actions.
+        act: (params, [frames uint8 [N, S, H, W, C]], [key], step, epsilon) -> actions.
         stack: [tree of each seed] -> tree.
         parts: tree -> the tree of each seed in turn, on the device.
         rows: tree -> [tree of each seed], on the host; waits for the device.

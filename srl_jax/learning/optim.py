@@ -30,10 +30,11 @@ class Optimizer(NamedTuple):
 
     Attributes:
         init: {group: tree} -> {group: Adam's state}.
-        update: (grads, state, params, learning_rates, measure) -> (params, state, norms). All are by group;
-            learning rates are traced scalars. Norms are {"encoder": of its gradient, `NOT_MEASURED` where
-            `measure`, a traced bool, is false; "all": of the whole gradient before clipping, where there is
-            clipping}: each is a pass over the gradient.
+        update: (grads, state, params, learning_rates, measure, others) -> (params, state, norms). All are by
+            group; learning rates are traced scalars. `others` are groups that do not decay: RL's head in the
+            second pass. Norms are {"encoder": of its gradient, `NOT_MEASURED` where `measure`, a traced bool,
+            is false; "all": of the whole gradient before clipping, where there is clipping}: each is a pass
+            over the gradient.
         length: (a group's state) -> float32 scalar, the length of the step that left it, at a learning rate
             of 1; of a state that no step has left, of the first one, which is 1 for each number.
     """

@@ -4,6 +4,7 @@ Each raises a ValueError where an option is out of range. `register` adds one of
 `srl_jax.plugins`.
 """
 
+from srl_jax.learning.optim import ENCODER, ENCODER_SRL, RL, RL_SRL
 from srl_jax.objectives.bisimulation import bisimulation
 from srl_jax.objectives.forward_latent import forward_latent
 from srl_jax.objectives.forward_pixels import forward_pixels
@@ -37,5 +38,6 @@ REGISTRY = Registry(
         "bisimulation": bisimulation,
         "latent_l2": latent_l2,
     },
+    reserved=("none", RL, ENCODER, ENCODER_SRL, RL_SRL),
 )
 register = REGISTRY.register

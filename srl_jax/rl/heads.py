@@ -18,7 +18,7 @@ class QNetwork(nn.Module):
         num_actions: A.
         outputs: M, numbers for each action, as the kind of value has it: see `srl_jax.rl.values`.
         hidden: width of each stream.
-        dueling, noisy: the parts of Rainbow; noise_std only matters where noisy.
+        dueling, noisy: the parts of Rainbow; noisy_std only matters where noisy.
         prior: M constants added to the outputs of every action: what they start near; None: 0.
         shared_hidden: whether the two streams of a dueling network have one hidden layer, as Dopamine's.
         cosines: where above 0, latents are multiplied by an embedding of shares of probability, taus, in so

@@ -261,4 +261,4 @@ def n_step_one_reward(
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The n-step view of SPR in Dopamine's Atari 100k lab: `n_step_one_early` of the first reward alone."""
     _, discount_t, offset = n_step_one_early(rewards, discounts, valid, n)
-    return rewards[..., 0], discount_t, offset
+    return jnp.asarray(rewards[..., 0]), discount_t, offset

@@ -61,7 +61,7 @@ def evaluate(
     returns, lengths = np.zeros(games), np.zeros(games, int)
     score, length = np.zeros(number), np.zeros(number, int)
     game = np.arange(number)  # that each environment plays; from `games` on they do not count
-    recorded = [frames[0]][:record]
+    recorded = [frames[0].copy()][:record]  # a view would keep the frames of all environments
     step = played = 0
     while played < games:
         if stop():
@@ -72,7 +72,7 @@ def evaluate(
         length += 1
         stacks.push(frames)
         if len(recorded) < record and game[0] < games:
-            recorded.append(frames[0])
+            recorded.append(frames[0].copy())
         over = terminated | truncated | (length >= max_steps)
         if over.any():
             counts = over & (game < games)
@@ -83,7 +83,7 @@ def evaluate(
             frames, _ = env.reset(options={"reset_mask": over})
             stacks.begin(frames, over)
             if over[0] and len(recorded) < record and game[0] < games:
-                recorded.append(frames[0])
+                recorded.append(frames[0].copy())
         told(step, played)
     seen = np.stack(recorded) if recorded else np.zeros((0, *shape), np.uint8)
     return Evaluation(returns.tolist(), lengths.tolist(), seen)

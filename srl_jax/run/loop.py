@@ -73,8 +73,8 @@ def train_seeds(
 ) -> list[Result]:
     """Trains an agent of each seed, in step, writing rows and checkpoints into run directories.
 
-    How a run ended goes to its `ended.json`, see `srl_jax.run.ending`; a ConfigError before its first step
-    changes nothing there.
+    How a run ended goes to its `ended.json`, see `srl_jax.run.ending`. A ConfigError before its first step
+    changes nothing there, and nor does anything else before that of a run that is resumed.
     What stops one seed stops all; a return that ends a run early must be reached by all in one evaluation.
 
     Args:
@@ -100,7 +100,7 @@ def train_seeds(
         run = Run(configs, paths, progress=progress, agent=agent, resume=resume, stop=stop)
         results = run.train(begun)
     except BaseException as error:
-        if isinstance(error, ConfigError) and not (run and run.begun):
+        if not (run and run.begun) and (resume or isinstance(error, ConfigError)):
             raise
         for path in paths:  # of several, those that did nothing wrong were stopped
             own = error if getattr(error, "run", path) == path else KeyboardInterrupt()
@@ -134,35 +134,40 @@ class Run:
         self.env_threads = yielding_threads("environments", len(configs))
         # Environments are made in their threads, so that the threads that they start yield, too.
         envs = list(self.env_threads.map(lambda c: make_env(c, "train", c.num_envs), configs))
-        num_actions = int(envs[0].single_action_space.n)
-        frame = envs[0].single_observation_space.shape
-        self.agent = agent or make_agent(config, frame, num_actions)
-        self.device = over_seeds(self.agent, len(configs))
-        self.seeds = [
-            Seed(own, Path(out), self.agent, env, progress and i == 0)
-            for i, (own, out, env) in enumerate(zip(configs, outs, envs, strict=True))
-        ]
-        self.schedules = Schedules(config, self.agent.hyper, self.agent.objectives)
-        self.act_keys = [named_key(seed.key, "act") for seed in self.seeds]
-        if policy := given_policy(config, frame, num_actions):
-            for seed in self.seeds:
-                seed.policy = policy(named_key(seed.key, "given policy"))
-        self.env_steps = self.updates = 0
-        self.begun = False  # whether its directories say that it is under way
-        self.waiting: list[dict] = []  # metrics of updates, on the device
-        if resume is None:
-            start = initial_params(config, frame, self.agent)
-            states = [self.agent.init(seed.key, start) for seed in self.seeds]
-        else:
-            states = list(self.env_threads.map(Seed.restore, self.seeds, resume))
-            self.env_steps, self.updates = resume[0].env_steps, resume[0].updates
-        self.state = self.device.stack(states)
+        with contextlib.ExitStack() as refused:
+            refused.enter_context(self.env_threads)
+            for env in envs:
+                refused.callback(env.close)
+            num_actions = int(envs[0].single_action_space.n)
+            frame = envs[0].single_observation_space.shape
+            self.agent = agent or make_agent(config, frame, num_actions)
+            self.device = over_seeds(self.agent, len(configs))
+            self.seeds = [
+                Seed(own, Path(out), self.agent, env, progress and i == 0)
+                for i, (own, out, env) in enumerate(zip(configs, outs, envs, strict=True))
+            ]
+            self.schedules = Schedules(config, self.agent.hyper, self.agent.objectives)
+            self.act_keys = [named_key(seed.key, "act") for seed in self.seeds]
+            if policy := given_policy(config, frame, num_actions):
+                for seed in self.seeds:
+                    seed.policy = policy(named_key(seed.key, "given policy"))
+            self.env_steps = self.updates = 0
+            self.begun = False  # whether its directories say that it is under way
+            self.waiting: list[dict] = []  # metrics of updates, on the device
+            if resume is None:
+                start = initial_params(config, frame, self.agent)
+                states = [self.agent.init(seed.key, start) for seed in self.seeds]
+            else:
+                states = list(self.env_threads.map(Seed.restore, self.seeds, resume))
+                self.env_steps, self.updates = resume[0].env_steps, resume[0].updates
+            self.state = self.device.stack(states)
+            refused.pop_all()
 
     def __enter__(self) -> "Run":
         with contextlib.ExitStack() as stack:
-            stack.enter_context(self.env_threads)
             for seed in self.seeds:
                 seed.open(stack)
+            stack.enter_context(self.env_threads)  # last: environments close when no thread steps them
             self.opened = stack.pop_all()
         return self
 
@@ -367,7 +372,10 @@ class Run:
         return Diverged(f"{what} is not finite after {when}; the checkpoints are from before", seed.out)
 
     def write_train_rows(self) -> None:
-        """A "train" row of each seed: schedules, and means since the last one."""
+        """A "train" row of each seed: means since the last one, and schedules.
+
+        Epsilon and beta are those of the step that begins now; resets, n and gamma, of the one that ended.
+        """
         self.fetch()
         epsilon, beta, *_ = self.now
         weights = self.schedules.weights(self.env_steps)

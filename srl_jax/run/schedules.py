@@ -1,6 +1,7 @@
 """Schedules: what changes with env steps and updates, as functions of a configuration and these counts."""
 
 from collections.abc import Iterator, Mapping
+from fractions import Fraction
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -41,6 +42,8 @@ class Schedules:
 
     def __init__(self, config: Config, hyper: Hyper, objectives: Mapping[str, Objective] = {}):
         self._config, self._hyper = config, hyper
+        # Exact at any length: of 0.7, the float nearest to it, an update would come too late some day.
+        self._per_step = Fraction(config.updates_per_step).limit_denominator(10**6)
         weights = {name: objective.weight for name, objective in objectives.items()}
         self._weights = {name: x for name, x in weights.items() if isinstance(x, Weight) and x.steps}
         self._rates = {name: float(rate) for name, rate in hyper.learning_rates.items()}
@@ -76,7 +79,7 @@ class Schedules:
         return found
 
     def resets(self, env_steps: int) -> int:
-        """Resets until the step that begins then, which starts with one where this has grown."""
+        """How many resets have been made once the step that begins at `env_steps` has begun."""
         c = self._config
         if c.reset == "none":
             return 0
@@ -109,7 +112,7 @@ class Schedules:
         c = self._config
         if env_steps < c.learn_start:
             return 0
-        return int((env_steps - c.learn_start + c.num_envs) * c.updates_per_step + 1e-9)
+        return int((env_steps - c.learn_start + c.num_envs) * self._per_step)
 
 
 def passed(before: int, now: int, every: int) -> bool:

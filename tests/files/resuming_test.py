@@ -365,7 +365,7 @@ def test_a_process_that_was_killed_as_it_began_is_in_nobodys_way(tmp_path, kind,
     assert Config.load(path) == CONFIG
 
 
-@pytest.mark.parametrize("kind", ["config", "rows", "encoder", "half a checkpoint", "seeds"])
+@pytest.mark.parametrize("kind", ["config", "rows", "ended", "encoder", "half a checkpoint", "seeds"])
 @pytest.mark.parametrize("resume", [True, False])
 def test_a_run_that_ended_before_its_first_row_is_begun_anew(tmp_path, capsys, kind, resume):
     path = tmp_path / "run"
@@ -374,6 +374,8 @@ def test_a_run_that_ended_before_its_first_row_is_begun_anew(tmp_path, capsys, k
     make(run, other)
     if kind == "config":
         (run / "metrics.jsonl").unlink()
+    elif kind == "ended":
+        ending.write(run, ending.Ending("failed", 0, "RuntimeError: of the first step"))
     elif kind == "encoder":
         counts = {"frame_shape": (42, 42, 1), "num_actions": 3, "env_steps": 0, "updates": 0}
         checkpoint.save(run, PARAMS, other, folder="encoders", keep=0, **counts)

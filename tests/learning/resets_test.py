@@ -117,6 +117,15 @@ def table(values, every):
     return [line.split() for line in printed(Config(**values), every)]
 
 
+def test_no_update_comes_late_however_long_the_run():
+    schedules = Schedules(Config(updates_per_step=0.7, num_envs=10, learn_start=0), Hyper({}, {}))
+    assert [schedules.updates_due(10 * i) for i in (4_194_305, 2**40)] == [
+        7 * (i + 1) for i in (4_194_305, 2**40)
+    ]
+    third = Schedules(Config(updates_per_step=1 / 3, num_envs=1, learn_start=0), Hyper({}, {}))
+    assert [third.updates_due(i) for i in range(4)] == [0, 0, 1, 1]
+
+
 def test_bbfs_schedule_of_100_000_steps():
     schedules = Schedules(Config(**BBF), Hyper({}, {}))
     steps = range(100_001)

@@ -108,6 +108,18 @@ def test_games_of_the_first_environment_are_recorded_from_their_first_frame_to_t
     assert result.frames.ravel().tolist() == [0, 1, 2, 3, 10, 11, 12][:record]
 
 
+def test_what_is_recorded_is_a_copy():
+    class Reusing(Scripted):
+        buffer = np.zeros((1, 1, 1, 1), np.uint8)
+
+        def frames(self):
+            self.buffer[:] = super().frames()
+            return self.buffer
+
+    result = play(Reusing([[[0.0] * 3]]), games=1, record=10)
+    assert result.frames.ravel().tolist() == [0, 1, 2, 3] and result.frames.base is None
+
+
 def test_what_the_policy_sees():
     # Two steps a game. Stacks begin with the first frame of each game, and steps go on counting.
     seen = []

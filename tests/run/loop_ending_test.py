@@ -6,6 +6,7 @@ import itertools
 import os
 import threading
 import time
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -207,6 +208,45 @@ def test_an_error_of_an_environment_in_the_middle_is_said(tmp_path, monkeypatch)
     with pytest.raises(ConfigError, match="another shape"):
         train(tmp_path / "run")
     assert ending.read(tmp_path / "run").status == "failed"
+
+
+def test_environments_are_closed_where_no_thread_steps_them_and_where_a_run_is_refused(tmp_path, monkeypatch):
+    made, stepping, closed = [], [], []
+    make_env, step_env = loop.make_env, Seed.step_env
+
+    def making(*arguments):
+        env = make_env(*arguments)
+        close = env.close
+        env.close = lambda: (closed.append(list(stepping)), close())
+        return made.append(env) or env
+
+    def slowly(self, actions):
+        stepping.append(True)
+        time.sleep(0.1)
+        found = step_env(self, actions)
+        stepping.clear()
+        return found
+
+    monkeypatch.setattr(loop, "make_env", making)
+    monkeypatch.setattr(Seed, "step_env", slowly)
+    monkeypatch.setattr(loop.Run, "update", mock.Mock(side_effect=RuntimeError("meanwhile")))
+    with pytest.raises(RuntimeError, match="meanwhile"):
+        train(tmp_path / "run", learn_start=8)
+    assert len(made) == 1 and closed == [[]]
+    with pytest.raises(ConfigError, match="--buffer_size=12"):
+        train(tmp_path / "refused", learn_start=8, buffer_size=12)
+    assert len(made) == 2 and closed == [[], []]
+    assert not any(thread.name.startswith("environments") for thread in threading.enumerate())
+
+
+def test_what_ends_a_run_before_it_begins_leaves_how_it_ended_before(tmp_path, monkeypatch):
+    path = tmp_path / "run"
+    train(path, steps=40, keep_replay=True)
+    assert ending.read(path) == ("finished", 40, "")
+    monkeypatch.setattr(loop, "Seed", mock.Mock(side_effect=KeyboardInterrupt))
+    with pytest.raises(KeyboardInterrupt):
+        loop.train(Config(**{**SMALL, "steps": 400}), path, progress=False, resume=whole(path))
+    assert ending.read(path) == ("finished", 40, "")
 
 
 def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
