@@ -161,7 +161,7 @@ _ATARI100K: dict[str, dict[str, Any]] = {
     "drq_eps": {**_DRQ, "eps_final": 0.01, "eps_eval": 0.001},
     "curl": {**_DER, **_JOINT_100K, "objectives": ("infonce:temperature=10",)},
     "spr": _SPR,
-    "spr_resets": {**_SPR_JAX, "reset": "head", "reset_every": 20_000, "reset_last": 80_000},
+    "spr_resets": {**_SPR_JAX, "reset": "head_last", "reset_every": 20_000, "reset_last": 80_000},
     "sr_spr": {
         **_SPR_JAX,
         "rl": f"rainbow:noisy=false,n_step=10,shared_hidden=true,{_SLOW}",

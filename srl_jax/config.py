@@ -138,8 +138,9 @@ class Config:
     reset: str = _value(
         str, "none",
         "what is drawn anew in the course of the run, with its slow copies and Adam's moments; head: RL's "
-        "head; all: all heads, and the encoder and SPR's transition are shrunk",
-        choices=("none", "head", "all"),
+        "head; head_last: its last layers, behind the hidden ones; all: all heads, and the encoder and SPR's "
+        "transition are shrunk",
+        choices=("none", "head", "head_last", "all"),
     )  # fmt: skip
     reset_every: int = _steps(0, "env steps between two resets", minimum=0)
     reset_last: int = _steps(0, "env step after which there is no reset; 0: they go on", minimum=0)

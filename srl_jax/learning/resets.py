@@ -1,8 +1,9 @@
 """Resets: parts of a learner that are drawn anew while a run goes on, against what it learnt too early.
 
-Nikishin et al. (2022), The Primacy Bias in Deep Reinforcement Learning, reset RL's head. D'Oro et al. (2023),
-Sample-Efficient Reinforcement Learning by Breaking the Replay Ratio Barrier, and Schwarzer et al. (2023),
-Bigger, Better, Faster, reset all heads, and shrink and perturb the encoder. Replay stays as it is.
+Nikishin et al. (2022), The Primacy Bias in Deep Reinforcement Learning, reset the last layers of RL's head.
+D'Oro et al. (2023), Sample-Efficient Reinforcement Learning by Breaking the Replay Ratio Barrier, and
+Schwarzer et al. (2023), Bigger, Better, Faster, reset all heads, and shrink and perturb the encoder. Replay
+stays as it is.
 `srl_jax.run.schedules` says when there is a reset.
 """
 
@@ -17,20 +18,23 @@ from srl_jax.types import Array, Params, TrainState
 
 TRANSITION = "transition"
 """The name of what is shrunk in an objective's head, as SPR's model of the next latent."""
+HIDDEN = ("hidden", "embedding")
+"""Ends of the names of the layers of RL's head that come before its last ones."""
 
 
 def kept(kind: str, group: str, path: tuple[str, ...], shrink: float) -> float:
     """The share of a parameter that a reset leaves; the rest is of fresh ones. 1 leaves it as it is.
 
     Args:
-        kind: "head": RL's head alone is reset; "all": all heads are, and the encoder and each head's
-            "transition" are shrunk.
+        kind: "head": RL's head alone is reset; "head_last": of it the last layers alone; "all": all heads
+            are, and the encoder and each head's "transition" are shrunk.
         group: of parameters: the encoder's, or an objective's name.
         path: names that lead to the parameter in its group.
         shrink: the share that is left of what is shrunk.
     """
-    if kind == "head":
-        return 0.0 if group == RL else 1.0
+    if kind in ("head", "head_last"):
+        stays = kind == "head_last" and "".join(path[:1]).endswith(HIDDEN)
+        return 0.0 if group == RL and not stays else 1.0
     return shrink if group == ENCODER or path[:1] == (TRANSITION,) else 0.0
 
 

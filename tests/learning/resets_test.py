@@ -13,9 +13,10 @@ from srl_jax.errors import ConfigError
 from srl_jax.learning import annealing
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import make_optimizer
-from srl_jax.learning.resets import reset, reset_key
+from srl_jax.learning.resets import kept, reset, reset_key
 from srl_jax.learning.update import Hyper, make_init, passes, periodic
 from srl_jax.objectives import REGISTRY
+from srl_jax.rl import REGISTRY as ALGORITHMS
 from srl_jax.rl import rainbow
 from srl_jax.run.schedules import Schedules, printed
 from srl_jax.types import TrainState
@@ -65,6 +66,30 @@ def test_a_head_is_reset_with_its_slow_copy_and_moments_and_nothing_else(states)
     of_rl = {"encoder": before.slow["rl"]["encoder"], "head": fresh.slow["rl"]["head"]}
     assert identical(after.slow, before.slow | {"rl": of_rl})
     assert after.step == 70 and after.key == "key"
+
+
+def test_the_last_layers_of_a_head_are_reset_and_what_it_has_before_them_stays(states):
+    before, fresh = states
+    after = reset(before, fresh, "head_last", 0.5)
+
+    def last(old, new):
+        return old | {name: new[name] for name in ("q_out", "v_out")}
+
+    assert identical(after.params, before.params | {"rl": last(before.params["rl"], fresh.params["rl"])})
+    old, new = before.opt_state["rl"], fresh.opt_state["rl"]
+    own = old._replace(count=np.int32(0), mu=last(old.mu, new.mu), nu=last(old.nu, new.nu))
+    assert identical(after.opt_state, before.opt_state | {"rl": own})
+    old, new = before.slow["rl"], fresh.slow["rl"]
+    of_rl = {"encoder": old["encoder"], "head": last(old["head"], new["head"])}
+    assert identical(after.slow, before.slow | {"rl": of_rl})
+
+
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_every_head_has_last_layers_and_what_comes_before(name):
+    shapes = jax.eval_shape(ALGORITHMS[name](make_context()).objective.init, jax.random.key(0))
+    share = {layer: kept("head_last", "rl", (layer, "kernel"), 0.5) for layer in shapes}
+    assert share == {layer: 0.0 if layer in ("q_out", "v_out") else 1.0 for layer in shapes}
+    assert set(share.values()) == {0.0, 1.0}
 
 
 def test_all_heads_are_reset_and_the_encoder_and_the_transition_are_shrunk(states):

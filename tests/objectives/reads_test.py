@@ -163,6 +163,11 @@ def test_a_reset_of_rls_head_resets_its_copies_and_both_adams():
     assert helpers.identical(new.slow["spr"]["read"], fresh.slow["spr"]["read"])
     assert helpers.identical(new.slow["spr"]["head"], old.slow["spr"]["head"])
     assert all_zero(new.opt_state[RL_SRL].mu) and helpers.identical(new.opt_state["spr"], ones["spr"])
+    # What SPR projects by is before the last layers.
+    new = reset(old._replace(opt_state=ones), fresh, "head_last", 0.5)
+    assert helpers.identical(new.slow["spr"], old.slow["spr"])
+    moments = new.opt_state[RL_SRL].mu
+    assert helpers.identical(moments["q_hidden"], ones[RL_SRL].mu["q_hidden"]) and all_zero(moments["q_out"])
 
 
 @pytest.mark.parametrize(
