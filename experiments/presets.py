@@ -169,6 +169,7 @@ _ATARI100K: dict[str, dict[str, Any]] = {
         "updates_per_step": 8,
         "reset": "all",
         "reset_every": 5_000,
+        "reset_last": 95_000,
         "shrink": 0.8,
     },
     "bbf": {

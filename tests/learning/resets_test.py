@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from experiments.presets import preset_values
 from srl_jax import checks
 from srl_jax.config import Config, resolve
 from srl_jax.errors import ConfigError
@@ -22,16 +23,11 @@ from srl_jax.run.schedules import Schedules, printed
 from srl_jax.types import TrainState
 from tests.helpers import fill, identical, make_context, make_encoder
 
-BBF = dict(
-    steps=100_000, num_envs=1, learn_start=2_000, updates_per_step=2.0, rl="rainbow:n_step=10", gamma=0.997,
-    gamma_anneal="0.97->0.997@10000", n_anneal="10->3@10000", reset="all", reset_every=20_000,
-    reset_last=80_000,
-)  # fmt: skip
-SR_SPR = dict(
-    steps=100_000, num_envs=1, learn_start=2_000, updates_per_step=8.0, rl="rainbow:n_step=10", reset="all",
-    reset_every=5_000, reset_last=95_000, shrink=0.8,
-)  # fmt: skip
-"""Of bbf/configs/BBF.gin and SR_SPR.gin of google-research: no reset where the next were past 100,000."""
+BBF, SR_SPR, SPR_RESETS = (
+    Config(**preset_values(f"atari100k/{name}")) for name in ("bbf", "sr_spr", "spr_resets")
+)
+"""Of google-research's BBF.gin and SR_SPR.gin, with no reset where the next were past 100,000, and of
+rl_with_resets' SPR_with_resets.gin, which has four."""
 
 
 # What a reset leaves
@@ -138,8 +134,8 @@ def test_each_reset_draws_with_a_key_of_its_own():
 # When, and n and gamma after it
 
 
-def table(values, every):
-    return [line.split() for line in printed(Config(**values), every)]
+def table(config, every):
+    return [line.split() for line in printed(config, every)]
 
 
 def test_no_update_comes_late_however_long_the_run():
@@ -152,7 +148,7 @@ def test_no_update_comes_late_however_long_the_run():
 
 
 def test_bbfs_schedule_of_100_000_steps():
-    schedules = Schedules(Config(**BBF), Hyper({}, {}))
+    schedules = Schedules(BBF, Hyper({}, {}))
     steps = range(100_001)
     counts = [schedules.resets(step) for step in steps]
     assert [i for i in steps if i and counts[i] > counts[i - 1]] == [20_000, 40_000, 60_000, 80_000]
@@ -185,6 +181,13 @@ def test_sr_sprs_schedule_of_100_000_steps():
     assert [int(line[2]) for line in lines] == [*range(20), 19]
     assert [int(line[3]) for line in lines] == [0] * 20 + [40_000]
     assert {tuple(line[4:]) for line in lines} == {("-", "0.99000")}
+
+
+def test_spr_is_reset_four_times_in_100_000_steps():
+    # Two updates a step: 36,000 before the first reset, then 40,000 each.
+    lines = table(SPR_RESETS, 20_000)[1:]
+    assert [int(line[2]) for line in lines] == [0, 1, 2, 3, 4, 4]
+    assert [int(line[1]) for line in lines] == [0, 36_000, 76_000, 116_000, 156_000, 196_000]
 
 
 def test_resets_come_with_the_first_step_that_begins_then_or_later():
