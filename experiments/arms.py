@@ -22,7 +22,7 @@ from srl_jax.files.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text, near
 
 from .command_line.flags import MOVED
-from .presets import parts
+from .presets import preset_values
 from .sweeping.plan import arm_of
 
 
@@ -199,7 +199,7 @@ def read_figure(path: Path) -> Figure:
     for number, arm in enumerate(values["arms"], 1):
         arm = check(arm, kinds, ("name", "preset"), f"arm {number}")
         try:
-            parts(arm["preset"])
+            preset_values(arm["preset"])
         except ConfigError as error:
             raise refuse(f"arm {number}: no preset {error}") from None
         flags = {

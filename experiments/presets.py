@@ -2,15 +2,17 @@
 
 A preset is a dict of `srl_jax.config.Config` fields; what it leaves out keeps its default, and
 flags given beside it override it. `thesis/joint_256+small` is a preset that the parts behind it change, one
-after the other: `PIECES`, or presets. The thesis is Guberina & Desta, 2022; its figures' arms keep
-their names here.
+after the other: `PIECES`, `objective/NAME`, or presets. The thesis is Guberina & Desta, 2022; its figures'
+arms keep their names here.
 """
 
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from srl_jax.learning.modes import GATES, MODES, PROJECTING, both_train
 from srl_jax.specs import choices_text, join, split
 
 from .protocols import PROTOCOLS, PROTOCOLS_HELP
@@ -286,6 +288,27 @@ def _over(own: Mapping[str, Any], values: dict[str, Any]) -> dict[str, Any]:
     return {**values, **own}
 
 
+def _with_objective(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Settings with one more objective; RL alone becomes joint training."""
+    mode = "joint" if values["mode"] == "rl_only" else values["mode"]
+    if not MODES[mode].representation:
+        raise ConfigError(f"the preset is of --mode={mode}, which runs no representation loss")
+    there = values.get("objectives", ())
+    if name in (split(text)[0] for text in there):
+        raise ConfigError(f"the preset has it; --objective=+{name}:key=value beside it changes its options")
+    return {**values, "mode": mode, "objectives": (*there, name)}
+
+
+def _with_gate(name: str, values: dict[str, Any]) -> dict[str, Any]:
+    """Settings with a gate, and one Adam of the encoder where it cannot do with two that step in turn."""
+    if not both_train(MODES[mode := values["mode"]]):
+        joint = "; write objective/NAME before it, for --mode=joint" if mode == "rl_only" else ""
+        raise ConfigError(f"in --mode={mode} RL and representation do not both train the encoder{joint}")
+    if name in PROJECTING and values.get("encoder_optimizer", Config.encoder_optimizer) == "separate":
+        values = {**values, "encoder_optimizer": "summed"}
+    return {**values, "gate": name}
+
+
 PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "small": _small,
     "textbook": functools.partial(
@@ -294,8 +317,9 @@ PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "five_choices": functools.partial(_with_options, _FIVE_CHOICES),
     "aug": functools.partial(_over, _AUG),
     **{f"protocol/{name}": functools.partial(_over, own) for name, own in PROTOCOLS.items()},
+    **{f"gate/{name}": functools.partial(_with_gate, name) for name in GATES},
 }
-"""What may stand behind a preset and a +: functions of its settings."""
+"""What may stand behind a preset and a +, beside `objective/NAME`: functions of its settings."""
 
 PIECES_HELP = {
     "small": "at the size of Catch, minutes a run",
@@ -303,7 +327,11 @@ PIECES_HELP = {
     "five_choices": "with the five choices of results/pong_choices, of Rainbow's and C51's presets",
     "aug": "with random shift of all frames",
     **{f"protocol/{name}": text for name, text in PROTOCOLS_HELP.items()},
+    **{f"gate/{name}": f"with --gate={name}: {text}" for name, text in GATES.items()},
 }
+
+OBJECTIVE = "objective/"
+"""Begins the pieces that add a loss; whether there is one is asked where the registry, and so jax, is."""
 
 PRESETS: dict[str, dict[str, Any]] = {
     **{f"thesis/{name}": values for name, values in _ARMS.items()},
@@ -357,19 +385,11 @@ _SOLVED = {"Pong": 20.0}
 """Mean evaluation return at which the thesis' runs of a game stop early."""
 
 
-def parts(name: str) -> list[str]:
-    """The preset that a name begins with, and what stands behind it.
-
-    Raises:
-        ConfigError: one of them is unknown; the line begins with the name.
-    """
-    first, *rest = name.split("+")
-    if first in PIECES:
-        raise ConfigError(f"{name}: {first} changes a preset; write it behind one, thesis/joint_256+{first}")
-    for part, known in ((first, PRESETS), *((part, {**PIECES, **PRESETS}) for part in rest)):
-        if part not in known:
-            raise ConfigError(f"{name}: {choices_text(part, known)}")
-    return [first, *rest]
+def _piece(part: str) -> Callable[[dict[str, Any]], dict[str, Any]] | None:
+    """What a part behind a preset does to its settings, or None."""
+    if part.startswith(OBJECTIVE) and (name := part.removeprefix(OBJECTIVE)).isidentifier():
+        return functools.partial(_with_objective, name)
+    return PIECES.get(part)
 
 
 def preset_values(name: str, game: str | None = None) -> dict[str, Any]:
@@ -381,12 +401,22 @@ def preset_values(name: str, game: str | None = None) -> dict[str, Any]:
             only.
 
     Raises:
-        ConfigError: see `parts`.
+        ConfigError: a part is unknown, or cannot change what stands before it; the line begins with the name.
     """
-    first, *rest = parts(name)
+    first, *rest = name.split("+")
+    if _piece(first):
+        raise ConfigError(f"{name}: {first} changes a preset; write it behind one, thesis/joint_256+{first}")
+    if first not in PRESETS:
+        raise ConfigError(f"{name}: {choices_text(first, PRESETS)}")
     values = dict(PRESETS[first])
     for part in rest:
-        values = PIECES[part](values) if part in PIECES else {**values, **PRESETS[part]}
+        piece = functools.partial(_over, PRESETS[part]) if part in PRESETS else _piece(part)
+        if piece is None:
+            raise ConfigError(f"{name}: {choices_text(part, [*PIECES, f'{OBJECTIVE}NAME', *PRESETS])}")
+        try:
+            values = piece(values)
+        except ConfigError as error:
+            raise ConfigError(f"{name}: {part}: {error}") from None
     game = game or values["game"]
     whole = first.startswith("thesis/") and "small" not in rest
     if whole and values["mode"] != "pretrain" and game in _SOLVED:
@@ -397,11 +427,14 @@ def preset_values(name: str, game: str | None = None) -> dict[str, Any]:
 def source_preset(name: str, table: Mapping[str, str]) -> str:
     """The preset of the run that a preset's needs, changed likewise; "" where it needs none.
 
+    Objectives and gates that pieces add are of the run that needs it alone.
+
     Args:
         name: see `preset_values`.
         table: `ENCODER_PRESETS` or `POLICY_PRESETS`.
     """
     first, *rest = name.split("+")
+    rest = [part for part in rest if not part.startswith((OBJECTIVE, "gate/"))]
     return "+".join((table[first], *rest)) if first in table else ""
 
 

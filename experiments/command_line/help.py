@@ -2,7 +2,7 @@
 
 import sys
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 from absl import flags
@@ -10,7 +10,7 @@ from absl import flags
 from srl_jax import specs
 from srl_jax.files import display
 
-from ..presets import PIECES, PIECES_HELP, PRESETS, summary
+from ..presets import OBJECTIVE, PIECES, PIECES_HELP, PRESETS, summary
 from ..protocols import PROTOCOLS
 
 GROUPS: dict[str, str] = {
@@ -67,7 +67,7 @@ def text(about: str, values: flags.FlagValues) -> str:
         if shown:
             lines += [f"{title}:", *(line for flag in shown for line in flag), ""]
     if trains:
-        lines += ["Protocols:", *_protocols(), "", "Presets:", *_presets()]
+        lines += ["Protocols:", *_protocols(), "", "Presets:", *_presets(rows["objective"])]
     return "\n".join(lines).rstrip()
 
 
@@ -120,14 +120,17 @@ def _listed(rows: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
         yield from (_INDENT + part.replace(", ", ",") for part in broken)
 
 
-def _presets() -> Iterator[str]:
-    """A line for each preset; those of one family that another one and a piece make are told together."""
+def _presets(objectives: Iterable[str]) -> Iterator[str]:
+    """A line for each preset and piece; presets that another family's and a piece make are told together."""
     for name in PRESETS:
         if not name.startswith("small/"):
             yield f"  {name:34}  {summary(name)}"
     yield f"  {'small/NAME':34}  thesis/NAME+small"
     for name in PIECES:
         yield f"  {'PRESET+' + name:34}  {PIECES_HELP[name]}"
+    for name in objectives:
+        line = f"with --objective=+{name}, at its default options; --mode=rl_only becomes joint"
+        yield f"  {'PRESET+' + OBJECTIVE + name:34}  {line}"
 
 
 def _protocols() -> Iterator[str]:

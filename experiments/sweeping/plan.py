@@ -15,7 +15,7 @@ from srl_jax.specs import choices_text
 
 from .. import PACKAGE
 from ..command_line.flags import unknown
-from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, parts, preset_values, source_preset
+from ..presets import ENCODER_PRESETS, POLICY_PRESETS, PRESETS, preset_values, source_preset
 
 Flags = Mapping[str, str | tuple[str, ...]]
 """Flags of experiments.train as typed on the command line; a tuple's is repeated."""
@@ -183,7 +183,7 @@ def plan(
 
 
 def _checked_arm(arm: Arm) -> Arm:
-    parts(arm.preset)
+    preset_values(arm.preset)
     if not re.fullmatch(r"(?!\.)[A-Za-z0-9_.=-]*[A-Za-z0-9][A-Za-z0-9_.=-]*", arm.name):
         raise ConfigError("a name is made of letters, digits and _ - . =")
     if ".broken-" in arm.name:  # `run_data.run_directories` passes over it

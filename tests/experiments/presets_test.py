@@ -7,6 +7,7 @@ import pytest
 from experiments import train
 from experiments.presets import (
     ENCODER_PRESETS,
+    PIECES,
     POLICY_PRESETS,
     PRESETS,
     preset_values,
@@ -154,6 +155,43 @@ def test_what_stands_later_overrides():
     assert preset_values("catch/joint+small+aug")["encoder"] == "tiny"
 
 
+def test_an_objective_and_a_gate_are_pieces():
+    assert preset_values("atari100k/der+objective/spr+gate/orthogonal") == {
+        **PRESETS["atari100k/der"],
+        "mode": "joint",
+        "objectives": ("spr",),
+        "gate": "orthogonal",
+        "encoder_optimizer": "summed",
+    }
+    decoupled = PRESETS["catch/decoupled"]
+    both = ("reconstruction:weight=1", "latent_l2:weight=1e-6", "mine")  # a row of --import, say
+    assert preset_values("catch/decoupled+objective/mine") == {**decoupled, "objectives": both}
+    # One Adam only where two step in turn, and only for gates that need both gradients at once.
+    assert preset_values("demo+gate/pcgrad") == {
+        **PRESETS["demo"], "gate": "pcgrad", "encoder_optimizer": "summed",
+    }  # fmt: skip
+    assert preset_values("demo+gate/rl_stopped") == {**PRESETS["demo"], "gate": "rl_stopped"}
+    two = {"mode": "joint", "encoder_optimizer": "simultaneous"}
+    assert PIECES["gate/pcgrad"](two) == {**two, "gate": "pcgrad"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        *(f"atari100k/der+objective/{name}" for name in objectives.REGISTRY),
+        *(f"atari100k/der+objective/spr+gate/{gate}" for gate in modes.GATES),
+        *(f"catch/{mode}+objective/spr" for mode in ("rl_only", "pretrain", "joint", "decoupled")),
+        "atari100k/bbf+gate/orthogonal",
+        "thesis/joint_256+objective/inverse+gate/pcgrad+small",
+    ],
+)
+def test_a_preset_with_pieces_is_a_valid_run(name):
+    full = train.resolved(checks.check(_config(name), given=()))
+    pieces = dict(part.split("/") for part in name.split("+")[1:] if "/" in part)
+    assert full.gate == pieces.get("gate", "sum")
+    assert not pieces.get("objective") or full.objectives[-1].startswith(f"{pieces['objective']}:weight=")
+
+
 @pytest.mark.parametrize(
     ("name", "told"),
     [
@@ -161,17 +199,31 @@ def test_what_stands_later_overrides():
         ("thesis/joint_256+smal", "did you mean small"),
         ("small", "small changes a preset; write it behind one"),
         ("catch/joint+", "valid: small, textbook, five_choices, aug"),
+        ("objective/spr", "objective/spr changes a preset; write it behind one"),
+        ("gate/pcgrad+demo", "gate/pcgrad changes a preset; write it behind one"),
+        ("demo+objectives/spr", "did you mean objective/NAME?"),
+        ("demo+objective/spr:steps=2", "did you mean objective/NAME?"),
+        ("demo+gate/pcgrd", "did you mean gate/pcgrad?"),
+        ("thesis/frozen_256+objective/spr", "objective/spr: the preset is of --mode=frozen, which runs no"),
+        ("atari100k/spr+objective/spr", "objective/spr: the preset has it; --objective=+spr:key=value"),
+        ("atari100k/der+gate/sum+objective/spr", "gate/sum: in --mode=rl_only RL and representation do not"),
+        ("atari100k/der+gate/sum", "write objective/NAME before it, for --mode=joint"),
+        ("atari100k/mrq+gate/pcgrad", "gate/pcgrad: in --mode=decoupled RL and representation do not both"),
     ],
 )
 def test_a_preset_that_there_is_not_is_refused(name, told):
     with pytest.raises(ConfigError) as error:
         preset_values(name)
     assert str(error.value).startswith(f"{name}: ") and told in str(error.value)
+    assert "\n" not in str(error.value)
 
 
 def test_a_changed_preset_starts_from_one_that_is_changed_likewise():
     assert source_preset("thesis/frozen_256+small", ENCODER_PRESETS) == "thesis/pretrain_256+small"
     assert source_preset("thesis/joint_256+small", ENCODER_PRESETS) == ""
+    # What is added to this run's losses is not of the one that it starts from.
+    name = "thesis/joint_from_pretrained_256+objective/spr+gate/orthogonal+aug"
+    assert source_preset(name, ENCODER_PRESETS) == "thesis/pretrain_256+aug"
 
 
 @pytest.mark.parametrize("name", PRESETS)

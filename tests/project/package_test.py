@@ -89,6 +89,8 @@ def test_the_library_is_one_import_and_costs_nothing_until_it_is_used():
         import srl_jax
         light = "jax" not in sys.modules and "numpy" not in sys.modules
         config = srl_jax.Config(game="Catch")
+        from experiments.presets import preset_values
+        config = srl_jax.Config(**preset_values("demo+objective/spr+gate/pcgrad"))
         light = light and "jax" not in sys.modules
         from srl_jax import *
         from srl_jax.replay import Replay as replay

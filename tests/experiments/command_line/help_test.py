@@ -58,6 +58,7 @@ def test_every_preset_has_a_line():
         *(name for name in PRESETS if not name.startswith("small/")),
         "small/NAME",
         *(f"PRESET+{piece}" for piece in PIECES),
+        *(f"PRESET+objective/{name}" for name in objectives.REGISTRY),
     ]
     assert PIECES_HELP.keys() == PIECES.keys()
 

@@ -55,6 +55,7 @@ def test_what_a_process_elsewhere_imports_is_named_absolutely(tmp_path, monkeypa
         ([arm_of("small/joint_256"), arm_of("thesis/joint_256")], [], {}, "joint_256: there twice"),
         ([arm_of("small/frozen_256"), Arm("pretrain_256", "small/joint_256")], [], {}, "another name"),
         ([arm_of("small/nope")], [], {}, "small/nope: did you mean"),
+        ([arm_of("catch/rl_only+gate/sum")], [], {}, "arm rl_only_sum: .*: gate/sum: in --mode=rl_only RL"),
         ([Arm("../x", "small/joint_256")], [], {}, "letters, digits"),
         ([Arm("x.broken-1", "small/joint_256")], [], {}, "moved aside"),
         ([Arm("a", "small/joint_256", {"seed": "3"})], [], {}, "arm a: --seed"),
