@@ -69,8 +69,8 @@ def spr(
         target: "slow", slow copies of encoder and projection (the paper's arm without augmentation);
             "stopped", the online ones without gradient (its arm with augmentation).
         tau: of the slow copies, see `srl_jax.learning.update.ema`.
-        mask: whether steps behind the end of an episode count 0. In the authors' code the step onto its last
-            observation does, too, and a lost life is an end.
+        mask: whether steps behind the end of an episode count 0; the authors' code leaves out the last
+            observation of an episode, too, and takes a lost life for an end.
         importance: whether the loss is multiplied by replay's importance weights, as in the authors' code.
 
     Raises:
