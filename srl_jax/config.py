@@ -137,9 +137,8 @@ class Config:
     )  # fmt: skip
     reset: str = _value(
         str, "none",
-        "what is drawn anew in the course of the run, with its slow copies and Adam's moments; head: RL's "
-        "head; head_last: its last layers, behind the hidden ones; all: all heads, and the encoder and SPR's "
-        "transition are shrunk",
+        "what is drawn anew in the run, with its slow copies and Adam's moments; head: RL's; head_last: its "
+        "layers behind the hidden ones; all: all heads, and the encoder and SPR's transition are shrunk",
         choices=("none", "head", "head_last", "all"),
     )  # fmt: skip
     reset_every: int = _steps(0, "env steps between two resets", minimum=0)
