@@ -1,11 +1,11 @@
-"""srl_jax/augment.py against numpy's padding, and a shift drawn by hand."""
+"""srl_jax/augment.py against numpy's padding, a shift drawn by hand, and the spread of an intensity."""
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax.augment import make_view, random_shift
+from srl_jax.augment import intensity, make_view, random_shift
 
 
 def shifts(frames, pad):
@@ -63,3 +63,16 @@ def test_four_pixels_is_the_default_and_none_the_identity():
     assert found <= allowed
     assert len(found) > 60  # 81 shifts; 3 pixels would have 49
     np.testing.assert_array_equal(draw(frames, 0, 1)[0], frames)
+
+
+@pytest.mark.parametrize("options", [{}, {"scale": 0.2}])
+def test_an_intensity_is_one_normal_factor_for_a_sequence_within_two_deviations(options):
+    frames = np.random.default_rng(0).integers(1, 256, (2, 3, 4, 1), dtype=np.uint8)
+    keys = jax.random.split(jax.random.key(0), 1000)
+    seen = np.asarray(jax.jit(jax.vmap(lambda key: intensity(frames, key, **options)))(keys))
+    factors = (seen / (frames / 255)).reshape(1000, -1)
+    np.testing.assert_allclose(factors, np.broadcast_to(factors[:, :1], factors.shape), rtol=1e-5)
+    e = (factors[:, 0] - 1) / options.get("scale", 0.05)
+    assert [e.min(), e.max()] == pytest.approx([-2, 2], abs=1e-4)
+    # 46 of the 1000 are expected to be cut off, and the others' deviation makes it 0.96; its error is 0.02.
+    assert abs(e.mean()) < 0.1 and e.std() == pytest.approx(0.96, abs=0.06)
