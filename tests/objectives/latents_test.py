@@ -1,25 +1,23 @@
-"""The representation objectives that predict, compare and contrast latents, each by a number that is known.
+"""The representation objectives that predict and compare latents, each by a number that is known.
 
-What every row of the registry keeps is in objectives_test.py.
+Those of two views are in two_views_test.py. What every row of the registry keeps is in objectives_test.py.
 """
+
+import functools
+import itertools
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import encoders, objectives
+from srl_jax import encoders, layers, objectives
 from srl_jax.augment import make_view
-from srl_jax.latents import make_latents
 from srl_jax.objectives.bisimulation import bisimulation_error
-from srl_jax.objectives.infonce import info_nce
 from srl_jax.objectives.latent_l2 import l2_norm
 from srl_jax.objectives.networks import cosine_distance, mean_squared_error, over_others
 from srl_jax.objectives.reward import binary_cross_entropy, symlog, two_hot
-from srl_jax.objectives.slowness import similarity, squared_step
-from srl_jax.objectives.spr import min_max
-from srl_jax.objectives.two_views import covariance_loss, cross_correlation, variance_loss
-from srl_jax.objectives.vae import gaussian_divergence
+from srl_jax.objectives.slowness import similarity
 from srl_jax.types import Context, Latents, Window
 from tests import helpers
 from tests.helpers import (
@@ -28,9 +26,9 @@ from tests.helpers import (
     latents_of,
     loss_of,
     make_context,
-    make_encoder,
     make_window,
 )
+from tests.objectives.by_numpy import dense, log_softmax, min_max, mlp, spr_distances, with_action
 
 BATCH, D = 4, 5
 
@@ -62,13 +60,6 @@ def test_means_over_other_valid_rows_by_hand():
 # Self-prediction
 
 
-def by_numpy(head, z: np.ndarray, action: np.ndarray) -> np.ndarray:
-    """`networks.MLP` over a latent and an action."""
-    x = np.concatenate([z, np.eye(NUM_ACTIONS)[action]], -1)
-    x = np.maximum(x @ head["hidden"]["kernel"] + head["hidden"]["bias"], 0)
-    return x @ head["out"]["kernel"] + head["out"]["bias"]
-
-
 @pytest.mark.parametrize("target", ["slow", "periodic", "stopped"])
 def test_forward_latent_against_numpy(target):
     z, slow = draw(3, BATCH, D), draw(3, BATCH, D, seed=1)
@@ -77,8 +68,8 @@ def test_forward_latent_against_numpy(target):
     window.valid[1, 1] = 0
     losses, head, _ = loss_of(objective, latents_of(z, slow), window)
     head, goal = head["MLP_0"], slow  # of `stopped`: the online encoder's, as the target view has them
-    first = z[0] + by_numpy(head, z[0], window.actions[:, 0])
-    second = first + by_numpy(head, first, window.actions[:, 1])
+    first = z[0] + mlp(head, with_action(z[0], window.actions[:, 0]))
+    second = first + mlp(head, with_action(first, window.actions[:, 1]))
     errors = [((p - g) ** 2).mean(-1) for p, g in ((first, goal[1]), (second, goal[2]))]
     np.testing.assert_allclose(losses, (errors[0] + window.valid[:, 1] * errors[1]) / 2, rtol=1e-5)
     assert (objective.slow is None) == (target == "stopped") and objective.horizon == 2
@@ -99,33 +90,21 @@ def test_only_target_gradient_lets_the_gradient_into_the_targets(target, reaches
     assert np.any(jax.grad(total)(jnp.asarray(draw(BATCH, D, seed=1))) != 0) == reaches
 
 
-@pytest.mark.parametrize("mask", [True, False])
-def test_spr_against_numpy(mask):
-    steps, hidden = 3, 6
-    z, slow = draw(steps + 1, BATCH, D), draw(steps + 1, BATCH, D, seed=1)
-    objective = objectives.spr(make_context(D), steps=steps, hidden=hidden, mask=mask, importance=True)
+@pytest.mark.parametrize(("mask", "shape"), [(True, (2, 3, 4)), (False, None)])
+def test_spr_against_numpy(mask, shape):
+    steps, features = 3, 24 if shape else D
+    z, slow = (draw(steps + 1, BATCH, features, seed=seed) for seed in (0, 1))
+    context = make_context(features)._replace(map_shape=shape)
+    objective = objectives.spr(context, steps=steps, hidden=6, mask=mask, importance=True)
     window = make_window(horizon=steps)
     window.valid[2, 1:] = 0
     window = window._replace(weight=np.array([1, 0.5, 1, 0.25], np.float32))
     losses, head, behind = loss_of(objective, latents_of(z, slow), window)
-
-    def scaled(x):  # SPR, section 2.3: into [0, 1] by each latent's own extremes
-        low, high = x.min(-1, keepdims=True), x.max(-1, keepdims=True)
-        return (x - low) / (high - low)
-
-    def linear(tree, x):
-        return x @ np.asarray(tree["kernel"]).reshape(x.shape[-1], -1) + tree["bias"]
-
-    state, total = scaled(z[0]), np.zeros(BATCH)
-    for k in range(steps):
-        action = np.eye(NUM_ACTIONS)[window.actions[:, k]]
-        maps = np.maximum(linear(head["transition"]["first"], np.concatenate([state, action], -1)), 0)
-        state = scaled(np.maximum(linear(head["transition"]["second"], maps), 0))
-        y = linear(head["predictor"], linear(head["projection"], state))
-        goal = linear(behind["projection"], scaled(slow[k + 1]))
-        cosine = (y * goal).sum(-1) / np.linalg.norm(y, axis=-1) / np.linalg.norm(goal, axis=-1)
-        total += (window.valid[:, k] if mask else 1) * (2 - 2 * cosine)
-    np.testing.assert_allclose(losses, window.weight * total / steps, rtol=1e-5, atol=1e-5)
+    goals = [dense(behind["projection"], min_max(x)) for x in slow[1:]]
+    project = functools.partial(dense, head["projection"])
+    distances = spr_distances(head, project, goals, z[0], window.actions, shape)
+    counted = distances * window.valid.T if mask else distances
+    np.testing.assert_allclose(losses, window.weight * counted.mean(0), rtol=1e-5)
     # The paper's loss is the sum of the negative cosines times 2: the same gradient at this weight.
     assert objectives.spr(make_context(D)).weight / 5 * 2 == 2
 
@@ -143,99 +122,11 @@ def test_spr_has_a_convolutional_transition_where_the_latent_is_a_map():
     assert kernels["first"]["kernel"].shape == (1, 1, D + NUM_ACTIONS, D)
 
 
-def test_min_max_by_hand():
-    np.testing.assert_allclose(min_max(np.array([1.0, 3.0, 2.0])), [0, 1, 0.5])
-    assert np.all(min_max(jnp.full(3, 7.0)) == 0)
+def test_a_constant_has_no_range():
+    assert np.all(layers.min_max(jnp.full(3, 7.0)) == 0)
 
 
-# Two views, and contrast
-
-
-def test_variance_and_covariance_of_vicreg_by_hand():
-    # Standard deviations 2 and sqrt(0.5), of samples; the second is short by 1 - 0.707.
-    z = jnp.array([[-2.0, 0.0], [2.0, 1.0]]) / jnp.array([jnp.sqrt(2.0), 1.0])
-    assert float(variance_loss(z)) == pytest.approx((1 - np.sqrt(0.5 + 1e-4)) / 2, rel=1e-5)
-    # The covariance of (-1, 1) and (0, 1) is 1: 1 twice, over two features.
-    assert float(covariance_loss(jnp.array([[-1.0, 0.0], [1.0, 1.0]]))) == pytest.approx(1.0)
-    # A single row has neither.
-    assert float(variance_loss(z[:1])) == pytest.approx(0.99) and float(covariance_loss(z[:1])) == 0
-
-
-def test_vicreg_weighs_its_terms_as_the_authors_code_does():
-    """Twice the same latents: 2 of variance for the mean of both views, 3 of each view's covariance."""
-    encoder = make_encoder()
-    window, params = make_window(), helpers.random_params(encoder.init)
-    objective = objectives.vicreg(
-        make_context(), hidden=0, outputs=3, invariance=5.0, variance=2.0, covariance=3.0, view="none"
-    )
-    head = helpers.random_params(objective.init)
-    latents = make_latents(encoder, params, params, window)
-    losses, metrics = objective.loss(head, head, latents, window, jax.random.key(0))
-    (layer,) = head.values()
-    z = np.asarray(latents.online(0)) @ layer["kernel"] + layer["bias"]
-    expected = 2 * float(variance_loss(z)) + 6 * float(covariance_loss(z))
-    np.testing.assert_allclose(losses, expected, rtol=1e-4)
-    assert float(metrics["variance"]) == pytest.approx(float(variance_loss(z)), rel=1e-4)
-
-
-def test_barlows_correlation_is_numpys():
-    one, other = draw(50, 3), draw(50, 3, seed=1)
-    expected = np.corrcoef(one.T, other.T)[:3, 3:]
-    np.testing.assert_allclose(cross_correlation(one, other), expected, rtol=1e-3, atol=1e-4)
-
-
-@pytest.mark.parametrize("name", ["byol", "vicreg", "barlow", "infonce"])
-def test_the_two_views_differ_and_are_drawn_by_the_key(name):
-    encoder = make_encoder()
-    window = make_window(horizon=1)
-    params = helpers.random_params(encoder.init)
-    objective = objectives.REGISTRY[name](make_context(), view="intensity")
-    latents = make_latents(encoder, params, params, window)
-    values = [loss_of(objective, latents, window, key=k)[0] for k in (0, 0, 1)]
-    assert np.array_equal(values[0], values[1]) and not np.array_equal(values[0], values[2])
-    with pytest.raises(ValueError, match="no view '.*'; did you mean shift"):
-        objectives.REGISTRY[name](make_context(), view="shfit")
-
-
-def test_byol_of_equal_networks_and_views_is_the_predictors_error():
-    encoder = make_encoder()
-    window, params = make_window(), helpers.random_params(encoder.init)
-    objective = objectives.byol(make_context(), hidden=4, outputs=3, view="none")
-    head = helpers.random_params(objective.init)
-    latents = make_latents(encoder, params, params, window)
-    losses, _ = objective.loss(head, head, latents, window, jax.random.key(0))
-
-    def mlp(tree, x):
-        x = np.maximum(x @ tree["hidden"]["kernel"] + tree["hidden"]["bias"], 0)
-        return x @ tree["out"]["kernel"] + tree["out"]["bias"]
-
-    goal = mlp(head["projection"], np.asarray(latents.online(0)))
-    y = mlp(head["predictor"], goal)
-    cosine = (y * goal).sum(-1) / np.linalg.norm(y, axis=-1) / np.linalg.norm(goal, axis=-1)
-    np.testing.assert_allclose(losses, 2 - 2 * cosine, rtol=1e-4, atol=1e-5)
-
-
-def test_info_nce_by_hand():
-    # Of exp(0), exp(log 3): a quarter and three quarters.
-    logits = jnp.array([[0.0, np.log(3)], [0.0, np.log(3)]])
-    np.testing.assert_allclose(info_nce(logits, jnp.ones(2)), np.log([4, 4 / 3]), rtol=1e-6)
-
-
-def test_infonce_leaves_out_rows_whose_future_is_not_valid():
-    encoder = make_encoder()
-    params = helpers.random_params(encoder.init)
-    objective = objectives.infonce(
-        make_context(), temporal=2, view="none", similarity="cosine", temperature=0.1
-    )
-    window = make_window(horizon=2)
-    window.valid[3, 1] = 0
-    losses, head, slow = loss_of(objective, make_latents(encoder, params, params, window), window)
-    three = jax.tree.map(lambda x: x[:3], window)
-    alone, _ = objective.loss(
-        head, slow, make_latents(encoder, params, params, three), three, jax.random.key(0)
-    )
-    np.testing.assert_allclose(losses, [*alone, 0], rtol=1e-5)
-    assert objective.horizon == 2
+# Views
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.float32])
@@ -286,15 +177,13 @@ def test_two_hot_by_hand():
 def test_a_linear_reward_model_against_numpy(loss):
     z, window = draw(1, BATCH, D), make_window(horizon=1)
     losses, head, _ = loss_of(objectives.reward(make_context(D), hidden=0, loss=loss), latents_of(z), window)
-    x = np.concatenate([z[0], np.eye(NUM_ACTIONS)[window.actions[:, 0]]], -1)
-    output = x @ head["out"]["kernel"] + head["out"]["bias"]
+    output = dense(head["out"], with_action(z[0], window.actions[:, 0]))
     if loss == "squared":
         expected = (output[:, 0] - window.rewards[:, 0]) ** 2
     else:
         place = (np.sign(window.rewards[:, 0]) * np.log1p(np.abs(window.rewards[:, 0])) + 10) / 20 * 64
         below = np.floor(place).astype(int)
-        logs = output - np.log(np.exp(output).sum(-1, keepdims=True))
-        rows = np.arange(BATCH)
+        logs, rows = log_softmax(output), np.arange(BATCH)
         expected = -(1 - place + below) * logs[rows, below] - (place - below) * logs[rows, below + 1]
     np.testing.assert_allclose(losses, expected, rtol=1e-4)
 
@@ -306,8 +195,7 @@ def test_terminal_is_a_discount_of_nothing(loss):
     losses, head, _ = loss_of(
         objectives.terminal(make_context(D), hidden=0, loss=loss), latents_of(z), window
     )
-    x = np.concatenate([z[0], np.eye(NUM_ACTIONS)[window.actions[:, 0]]], -1)
-    output = (x @ head["out"]["kernel"] + head["out"]["bias"])[:, 0]
+    output = dense(head["out"], with_action(z[0], window.actions[:, 0]))[:, 0]
     ends = np.array([0, 0, 1, 0])
     p = 1 / (1 + np.exp(-output))
     crossed = -np.where(ends, np.log(p), np.log(1 - p))
@@ -316,45 +204,54 @@ def test_terminal_is_a_discount_of_nothing(loss):
     )
 
 
-def test_bisimulation_error_by_hand():
-    # |z - z'| is (1 + 3) / 2 = 2; rewards differ by 1; what follows by sqrt((9 + 16) / 2), times 0.5.
-    z, other, z_t, other_t = (np.array(x, np.float32) for x in ([1, 3], [0, 0], [3, 4], [0, 0]))
-    error = bisimulation_error(z, 0.5, z_t, other, -0.5, other_t, 0.5)
-    assert float(error) == pytest.approx((2 - 1 - 0.5 * np.sqrt(12.5)) ** 2, rel=1e-5)
+def test_bisimulation_against_numpy():
+    z, window = draw(2, BATCH, D), make_window(horizon=1)
+    window.valid[1] = 0
+    losses, _, _ = loss_of(objectives.bisimulation(make_context(D), discount=0.5), latents_of(z), window)
+    expected = np.zeros(BATCH)
+    for i, j in itertools.permutations((0, 2, 3), 2):
+        apart = np.abs(z[0, i] - z[0, j]).mean()
+        follows = np.sqrt(((z[1, i] - z[1, j]) ** 2).mean())
+        target = abs(window.rewards[i, 0] - window.rewards[j, 0]) + 0.5 * follows
+        expected[i] += (apart - target) ** 2 / 2
+    np.testing.assert_allclose(losses, expected, rtol=1e-5)
+
+
+def test_bisimulations_gradient_flows_into_latents_and_not_into_next_ones():
+    z, other, z_t, other_t = draw(4, D)
     gradient = jax.grad(bisimulation_error, (0, 2, 3, 5))(z, 0.5, z_t, other, -0.5, other_t, 0.5)
     assert [bool(np.any(g != 0)) for g in gradient] == [True, False, True, False]
 
 
-def test_slowness_by_hand():
-    assert float(squared_step(np.array([1.0, 2]), np.array([0.0, 4]))) == 5
-    assert float(similarity(np.array([3.0, 0]), np.array([0.0, 4]))) == pytest.approx(np.exp(-5))
+def test_slowness_against_numpy():
+    z, window = draw(2, BATCH, D), make_window(horizon=1)
+    window.valid[1] = 0
+    losses, _, _ = loss_of(objectives.slowness(make_context(D), variability=3.0), latents_of(z), window)
+    expected = window.valid[:, 0] * ((z[1] - z[0]) ** 2).sum(-1)
+    for i, j in itertools.permutations((0, 2, 3), 2):
+        expected[i] += 3 * np.exp(-np.linalg.norm(z[0, i] - z[0, j])) / 2
+    np.testing.assert_allclose(losses, expected, rtol=1e-5)
+
+
+def test_latents_that_are_the_same_are_similar_without_a_gradient():
     same = jnp.ones(2)
-    assert float(similarity(same, same)) == 1
-    assert np.all(jax.grad(similarity)(same, same) == 0)
+    value, gradient = jax.value_and_grad(similarity)(same, same)
+    assert float(value) == 1 and np.all(gradient == 0)
 
 
-def test_gaussian_divergence_by_hand():
-    # 0.5 (9 + 1 - 1 - 0) and 0.5 (0 + 4 - 1 - log 4).
-    divergence = gaussian_divergence(np.array([3.0, 0.0]), np.array([0.0, np.log(4)]))
-    assert float(divergence) == pytest.approx(4.5 + 1.5 - np.log(2))
-
-
-def test_the_inverse_model_looks_as_far_as_it_is_told():
-    objective = objectives.inverse(make_context(D), steps=3)
-    window = make_window(horizon=3)
+def test_the_inverse_model_against_numpy():
+    objective = objectives.inverse(make_context(D), hidden=7, steps=3)
+    z, window = draw(4, BATCH, D), make_window(horizon=3)
+    window.actions[:] = [[0, 1, 2], [1, 0, 2], [2, 0, 1], [0, 2, 1]]
     window.valid[0, 2] = 0
-    z = draw(4, BATCH, D)
-    losses, head, _ = loss_of(objective, latents_of(z), window)
-    z[1:3] += 1
-    again, _ = objective.loss(head, None, latents_of(z), window, None)
-    z[3] += 1
-    other, _ = objective.loss(head, None, latents_of(z), window, None)
-    assert objective.horizon == 3 and losses[0] == 0 and np.all(losses[1:] > 0)
-    assert np.array_equal(losses, again) and not np.array_equal(losses, other)
-    # The accuracy is of valid rows.
-    window.valid[1:, 2] = 0
-    _, metrics = objective.loss(head, None, latents_of(z), window, None)
-    assert metrics["accuracy"] == 0
+    head = helpers.random_params(objective.init)
+    losses, metrics = objective.loss(head, None, latents_of(z), window, None)
+    network = {"hidden": head["Dense_1"], "out": head["Dense_0"]}  # flax numbers the outermost call first
+    logits, taken = mlp(network, np.concatenate([z[0], z[3]], -1)), window.actions[:, 0]
+    expected = -log_softmax(logits)[np.arange(BATCH), taken]
+    np.testing.assert_allclose(losses, window.valid[:, 2] * expected, rtol=1e-5)
+    assert float(metrics["accuracy"]) == pytest.approx(np.mean((logits.argmax(-1) == taken)[1:]))
+    assert objective.horizon == 3
 
 
 def test_latents_are_pulled_to_zero_or_to_the_slow_ones():
@@ -384,7 +281,8 @@ def test_latents_are_pulled_to_zero_or_to_the_slow_ones():
         ("reconstruction", {"noise": -0.1}, "noise"),
         ("forward_pixels", {"target": "pixels"}, "observation, difference"),
         ("latent_l2", {"norm": "l1"}, "half_squared, l2"),
-    ],
+    ]
+    + [(name, {"view": "shfit"}, "did you mean shift") for name in ("byol", "vicreg", "barlow", "infonce")],
 )
 def test_options_out_of_range_are_named(name, options, word):
     with pytest.raises(ValueError, match=word):

@@ -17,9 +17,8 @@ from srl_jax.latents import make_latents, shut
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, make_optimizer
 from srl_jax.learning.update import Hyper, make_init, make_update, periodic
-from srl_jax.objectives.inverse import action_cross_entropy
 from srl_jax.objectives.latent_l2 import half_squared_norm
-from srl_jax.types import Context, Latents, Objective, TrainState, Window
+from srl_jax.types import Context, Objective, TrainState, Window
 from srl_jax.window import image
 from tests import helpers
 from tests.helpers import SIZE, STACK, make_context, make_encoder, make_window
@@ -31,13 +30,6 @@ BATCH = 4
 
 def test_half_squared_norm_by_hand():
     assert float(half_squared_norm(np.array([3.0, -4.0]))) == 12.5  # (9 + 16) / 2
-
-
-def test_action_cross_entropy_by_hand():
-    # exp(0), exp(log 3): probabilities 1/4 and 3/4.
-    logits = jnp.array([0.0, np.log(3)])
-    assert float(action_cross_entropy(logits, 0)) == pytest.approx(np.log(4))
-    assert float(action_cross_entropy(logits, 1)) == pytest.approx(np.log(4 / 3))
 
 
 @pytest.mark.parametrize(("name", "offset"), [("reconstruction", 0), ("forward_pixels", 1)])
@@ -57,23 +49,6 @@ def test_forward_prediction_depends_on_the_action_of_its_row():
         row.picture(row.state, row.window._replace(actions=a)) for a in (row.window.actions, actions)
     )
     assert [np.array_equal(*pair) for pair in zip(before, after, strict=True)] == [True, False, True, True]
-
-
-def test_inverse_reads_both_latents_and_reports_its_accuracy():
-    context = make_context(features=2)
-    objective = objectives.inverse(context, hidden=5)
-    head = helpers.random_params(objective.init)
-    z = np.random.default_rng(0).normal(size=(2, BATCH, 2)).astype(np.float32)
-    window = make_window(horizon=1)
-    losses, metrics = objective.loss(head, None, Latents(lambda k: jnp.asarray(z[k]), None), window, None)
-
-    x = np.concatenate([z[0], z[1]], -1)
-    second, first = head["Dense_0"], head["Dense_1"]  # flax numbers the outermost call first
-    logits = np.maximum(x @ first["kernel"] + first["bias"], 0) @ second["kernel"] + second["bias"]
-    probs = np.exp(logits) / np.exp(logits).sum(-1, keepdims=True)
-    taken = window.actions[:, 0]
-    np.testing.assert_allclose(losses, -np.log(probs[np.arange(BATCH), taken]), rtol=1e-4)
-    assert float(metrics["accuracy"]) == np.mean(logits.argmax(-1) == taken)
 
 
 def test_inverse_needs_a_hidden_layer():

@@ -1,5 +1,7 @@
 """Objectives that compute with parameters of another group: SPR by RL's first layer, a tied decoder."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +33,7 @@ from tests.helpers import (
     make_encoder,
     make_window,
 )
+from tests.objectives.by_numpy import dense, min_max, spr_distances
 
 BATCH, D, STEPS = 4, 5, 2
 RATES = dict.fromkeys(("encoder", "encoder_srl", RL, "representation"), np.float32(0.01))
@@ -42,15 +45,6 @@ def rl_and_spr(features: int = D, row: str = "c51", **options):
     algorithm = rl.REGISTRY[row](context, hidden=3, **options)
     context = context._replace(rl_layer=algorithm.first_layer)
     return algorithm, context, objectives.spr(context, steps=STEPS, projection="rl")
-
-
-def scaled(x):
-    low, high = x.min(-1, keepdims=True), x.max(-1, keepdims=True)
-    return (x - low) / (high - low)
-
-
-def linear(tree, x):
-    return x @ np.asarray(tree["kernel"]).reshape(x.shape[-1], -1) + tree["bias"]
 
 
 @pytest.mark.parametrize(
@@ -74,18 +68,12 @@ def test_spr_by_the_first_layer_of_rl_against_numpy(target, options, layers):
     losses, _ = jax.jit(lambda *args: objective.loss(*args, latents_of(z, slow), window, None))(head, behind)
 
     def project(tree, x):
-        return np.concatenate([linear(tree[name], x) for name in layers], -1)
+        return np.concatenate([dense(tree[name], x) for name in layers], -1)
 
-    state, total = scaled(z[0]), np.zeros(BATCH)
-    for k in range(STEPS):
-        x = np.concatenate([state, np.eye(NUM_ACTIONS)[window.actions[:, k]]], -1)
-        maps = np.maximum(linear(own["transition"]["first"], x), 0)
-        state = scaled(np.maximum(linear(own["transition"]["second"], maps), 0))
-        y = linear(own["predictor"], project(of_rl, state))
-        goal = project(lagged if target == "slow" else of_rl, scaled(slow[k + 1]))
-        cosine = (y * goal).sum(-1) / np.linalg.norm(y, axis=-1) / np.linalg.norm(goal, axis=-1)
-        total += window.valid[:, k] * (2 - 2 * cosine)
-    np.testing.assert_allclose(losses, total / STEPS, rtol=1e-4, atol=1e-5)
+    below = lagged if target == "slow" else of_rl
+    goals = [project(below, min_max(x)) for x in slow[1:]]
+    distances = spr_distances(own, functools.partial(project, of_rl), goals, z[0], window.actions)
+    np.testing.assert_allclose(losses, (distances * window.valid.T).mean(0), rtol=1e-4, atol=1e-5)
 
 
 @pytest.mark.parametrize(
