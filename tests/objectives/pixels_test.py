@@ -35,6 +35,7 @@ from tests.helpers import (
     make_encoder,
     make_window,
 )
+from tests.objectives.by_numpy import dense
 
 BATCH = 4
 
@@ -155,6 +156,21 @@ def test_multiplied_actions_by_hand():
     params = {"latent": eye, "action": {"kernel": np.array([[2.0, 3.0]]), "bias": np.zeros(2)}, "out": eye}
     output = gate.apply({"params": params}, np.array([[1.0, 10.0]]), np.array([[1.0]]))
     np.testing.assert_allclose(output, [[2, 30]])
+
+
+def test_a_variational_autoencoder_against_numpy():
+    objective, key = objectives.vae(make_context(), beta=20.0), jax.random.key(5)
+    z, window = 2 * draw(1, BATCH, 8), make_window()
+    head = helpers.random_params(objective.init)
+    losses, metrics = objective.loss(head, None, latents_of(z), window, key)
+    log_variance = dense(head["log_variance"], z[0])
+    noisy = z[0] + np.sqrt(np.exp(log_variance)) * np.asarray(jax.random.normal(key, (BATCH, 8)))
+    pixels = np.moveaxis(window.frames[:, :STACK, :, :, 0], 1, -1).reshape(BATCH, -1) / 255
+    error = ((noisy @ head["decoder"]["kernel"] - pixels) ** 2).mean(-1)
+    divergence = (z[0] ** 2 + np.exp(log_variance) - 1 - log_variance).sum(-1) / 2
+    np.testing.assert_allclose(losses, error + 20 * divergence / (6 * 6 * 4), rtol=1e-5)
+    expected = {"squared_error": error.mean(), "divergence": divergence.mean()}
+    assert metrics == pytest.approx(expected, rel=1e-5)
 
 
 def test_what_is_corrupted_has_no_view_of_its_own():
