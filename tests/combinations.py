@@ -68,7 +68,7 @@ OPTIONS = {
 SETTINGS = {
     "encoder_optimizer": modes.ENCODER_OPTIMIZERS, "target_encoder": ("slow", "online"), "srl_every": (1, 2),
     "augment": ("none", "srl", "all"), "rl_view": VIEWS, "srl_view": VIEWS, "target_view": VIEWS,
-    "reset": ("head", "all"), "reset_last": (80,), "shrink": (0.8,), "lr_encoder": (1e-3,),
+    "reset": ("head", "head_last", "all"), "reset_last": (80,), "shrink": (0.8,), "lr_encoder": (1e-3,),
     "lr_encoder_srl": (1e-3,), "lr_final_share": (0.1,), "decoder_weight_decay": (1e-3,),
     "weight_decay": (0.1,), "max_grad_norm": (0.5, 10.0), "gamma_anneal": ("0.9->0.99@4",),
     "updates_per_step": (0.5,), "num_envs": (1,), "frame_stack": (1, 2), "diagnostics": (True,),

@@ -98,7 +98,7 @@ def spr(
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):
         ahead = [k + 1 for k in range(steps)]
-        below = slow_head if target == "slow" else jax.lax.stop_gradient(head)
+        below = jax.lax.stop_gradient(slow_head if target == "slow" else head)
         targets = latents.slow(ahead)
         predicted = [min_max(latents.online(0))]
         for k in range(steps):
