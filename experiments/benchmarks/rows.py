@@ -162,6 +162,7 @@ def _cost(title: str, ours: str, theirs: str, label: str, goal: str = "") -> Row
 
 
 NATURE, JOINT, SMALL = "thesis/rl_only_nature", "thesis/joint_256", "small/rl_only_256"
+DER = "atari100k/der"
 
 UPDATE = Group(
     _both("nature", NATURE, 60), {"update_nature": _beside_pytorch("rl_only nature", "nature", ">= 1.8")}
@@ -216,6 +217,33 @@ STARTUP = Group(
     rounds=3,
 )
 
+
+def _der_and(name: str) -> Program:
+    """An update of DER and an objective, one Adam on the sum."""
+    return _ours(DER, 100, mode="joint", objectives=(name,), encoder_optimizer="summed")
+
+
+def _beside_der(name: str, goal: str) -> Row:
+    return _cost(f"der and {name} / der", f"der {name}", "der", "der alone", goal)
+
+
+_HALF_OF_DER = {"acting or update alone": "der loop.slower half"}
+OF_DER = Group(
+    {
+        **_both("der", DER, 100),
+        **{f"der {name}": _der_and(name) for name in ("spr", "reconstruction", "infonce")},
+        "der loop": Program(".host_side.Loop", {"preset": DER}, {"env_steps": 200, "iterations": 200}),
+    },
+    {
+        "update_der": _beside_pytorch("atari100k/der", "der", ">= 2.2, <= 6 ms"),
+        "der_spr": _beside_der("spr", "<= 2.2"),
+        "der_reconstruction": _beside_der("reconstruction", "<= 1.5"),
+        "der_infonce": _beside_der("infonce", "<= 1.6"),
+        "loop_der": Row("loop Pong der, one environment", "env steps/s", "der loop.rate"),
+        "overlap_der": Row("loop der / slower half", "ms", "der loop.iteration", _HALF_OF_DER, "<= 1.1"),
+    },
+)
+
 _FRAMES = {"the frames alone": "memory.frames"}
 MEMORY = Group(
     {"memory": Program(".train_side.Memory", {"preset": NATURE}, {"buffer_size": 100_000})},
@@ -223,7 +251,7 @@ MEMORY = Group(
     rounds=1,
 )
 
-GROUPS = (UPDATE, UPDATES_OF_256, LOOP, REPLAY, STARTUP, MEMORY)
+GROUPS = (UPDATE, UPDATES_OF_256, OF_DER, LOOP, REPLAY, STARTUP, MEMORY)
 """The table, in order."""
 
 OBJECTIVES = (

@@ -1,4 +1,4 @@
-"""The update of three arms of the thesis in PyTorch, eager; a side of `worker`.
+"""The update of three arms of the thesis and of DER in PyTorch, eager; a side of `worker`.
 
 Parameters and batch come from srl_jax, and without noise the losses are srl_jax's, so that what is timed is
 the same mathematics. It imports nothing of srl_jax: what the two sides share, they state twice.
@@ -7,26 +7,43 @@ Here images are [B, C, H, W] and a flattened image runs over C, H, W; srl_jax ha
 """
 
 import time
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-STRIDES = {
-    "thesis/rl_only_nature": (4, 2, 1),
-    "thesis/rl_only_256": (2, 1, 1, 1),
-    "thesis/joint_256": (2, 1, 1, 1),
-}
-"""{preset: the strides of its encoder}; all else is seen from the parameters."""
 
-INPUT_GAIN = 255.0  # the presets' option gain
-N_STEP = 3
+class Recipe(NamedTuple):
+    """What of a preset is not seen from the parameters.
+
+    Attributes:
+        strides: the encoder's.
+        gain: of pixels in [0, 1].
+        n_step, adam_eps, max_grad_norm, slow_update_every: as in srl_jax; a norm of 0 clips nothing.
+    """
+
+    strides: tuple[int, ...]
+    gain: float = 255.0
+    n_step: int = 3
+    adam_eps: float = 1e-8
+    max_grad_norm: float = 0.0
+    slow_update_every: int = 500
+
+
+RECIPES = {
+    "thesis/rl_only_nature": Recipe((4, 2, 1)),
+    "thesis/rl_only_256": Recipe((2, 1, 1, 1)),
+    "thesis/joint_256": Recipe((2, 1, 1, 1)),
+    "atari100k/der": Recipe((5, 5), 1.0, 20, 1.5e-4, 10.0, 2000),
+}
+"""By preset."""
+
 ATOMS, V_MIN, V_MAX = 51, -10.0, 10.0
-LEARNING_RATE, ADAM_EPS = 1e-4, 1e-8
+LEARNING_RATE = 1e-4
 CHECK_ADAM_EPS = 1e-3  # see srl_jax' side
 DECODER_WEIGHT_DECAY = 1e-7
-SLOW_UPDATE_EVERY = 500  # updates
 WEIGHTS = {"rl": 1.0, "reconstruction": 1.0, "latent_l2": 1e-6}
 WARM_UPDATES = 5  # a process' first are slower
 
@@ -41,29 +58,27 @@ class Learner:
     Args:
         params: srl_jax's `TrainState.params` and `.slow`, by path.
         window: srl_jax's `Window`, with grey frames uint8 [B, S + K, H, W, 1]; the batch of all updates.
-        strides: the encoder's.
+        recipe: the preset's.
         memory_format: of images and kernels.
         separate: whether, in joint training, RL's Adam steps first, then the representation's own on the same
             batch, encoded anew, as the thesis' code does; else one Adam steps on the sum of the losses.
         noise: whether the head's layers have noise.
-        adam_eps: Adam's epsilon.
     """
 
     def __init__(
         self,
         params: dict[str, np.ndarray],
         window: dict[str, np.ndarray],
-        strides: tuple[int, ...],
+        recipe: Recipe,
         memory_format: torch.memory_format,
         separate: bool,
         noise: bool,
-        adam_eps: float = ADAM_EPS,
     ):
         self.window = window | {"frames": window["frames"][..., 0]}
         self.stack = window["frames"].shape[1] - window["actions"].shape[1]
-        self.strides, self.memory_format, self.noisy, self.steps = strides, memory_format, noise, 0
+        self.recipe, self.memory_format, self.noisy, self.steps = recipe, memory_format, noise, 0
         self.sizes = [window["frames"].shape[2]]
-        for i, stride in enumerate(strides):
+        for i, stride in enumerate(recipe.strides):
             kernel = params[f"{ENCODER}/Conv_{i}/kernel"]
             self.sizes.append((self.sizes[-1] - len(kernel)) // stride + 1)
         self.maps = (kernel.shape[-1], self.sizes[-1], self.sizes[-1])
@@ -78,7 +93,7 @@ class Learner:
             if separate:
                 groups.append([{"params": encoder}])
             groups[-1].append({"params": decoder, "weight_decay": DECODER_WEIGHT_DECAY})
-        self.optimizers = [torch.optim.Adam(some, lr=LEARNING_RATE, eps=adam_eps) for some in groups]
+        self.optimizers = [torch.optim.Adam(some, lr=LEARNING_RATE, eps=recipe.adam_eps) for some in groups]
         self.joint = bool(decoder)
         self.support = torch.linspace(V_MIN, V_MAX, ATOMS)
 
@@ -105,9 +120,11 @@ class Learner:
         batch = {name: torch.from_numpy(array) for name, array in self.window.items()}
         if self.noisy:
             self._draw_noise()
-        r_t, discount_t, offset = n_step(batch["rewards"], batch["discounts"], batch["valid"])
+        r_t, discount_t, offset = n_step(
+            batch["rewards"], batch["discounts"], batch["valid"], self.recipe.n_step
+        )
         pixels_tm1 = self._pixels(batch["frames"][:, : self.stack])
-        pixels_t = self._pixels(_stack_at(batch["frames"], offset, self.stack))
+        pixels_t = self._pixels(_stack_at(batch["frames"], offset, self.stack, self.recipe.n_step))
 
         z_tm1 = self._encode(ENCODER, pixels_tm1)
         logits_tm1 = self._logits(HEAD, z_tm1)
@@ -131,7 +148,7 @@ class Learner:
             self._step(first, losses)
         self.steps += 1
         with torch.no_grad():
-            if self.steps % SLOW_UPDATE_EVERY == 0:
+            if self.steps % self.recipe.slow_update_every == 0:
                 for path, value in self.params.items():
                     for group, slow in SLOW.items():
                         if path.startswith(group):
@@ -146,8 +163,8 @@ class Learner:
 
     def _encode(self, path: str, pixels: Tensor) -> Tensor:
         """float32 [B, S, H, W] in [0, 1] -> latents [B, D]; without a bottleneck, the flattened maps."""
-        x = pixels * INPUT_GAIN
-        for i, stride in enumerate(self.strides):
+        x = pixels * self.recipe.gain
+        for i, stride in enumerate(self.recipe.strides):
             x = F.relu(F.conv2d(x, *self._layer(f"{path}/Conv_{i}"), stride))
         x = x.flatten(1)
         if f"{path}/Dense_0/kernel" in self.params:
@@ -158,7 +175,7 @@ class Learner:
     def _decode(self, z: Tensor) -> Tensor:
         """The mirror of an encoder with a bottleneck: [B, D] -> float32 [B, S, H, W], linear at the end."""
         x = F.linear(z, *self._layer(f"{DECODER}/WideDense_0")).view(-1, *self.maps)
-        for i, stride in enumerate(reversed(self.strides)):
+        for i, stride in enumerate(reversed(self.recipe.strides)):
             kernel, bias = self._layer(f"{DECODER}/ConvTranspose_{i}")
             smaller, size = self.sizes[-1 - i], self.sizes[-2 - i]
             padding = size - ((smaller - 1) * stride + kernel.shape[-1])
@@ -202,6 +219,9 @@ class Learner:
     def _step(self, optimizer: torch.optim.Optimizer, losses: dict[str, Tensor]) -> None:
         optimizer.zero_grad()
         sum(WEIGHTS[name] * loss for name, loss in losses.items()).backward()
+        if self.recipe.max_grad_norm:
+            moved = [x for group in optimizer.param_groups for x in group["params"]]
+            torch.nn.utils.clip_grad_norm_(moved, self.recipe.max_grad_norm)
         optimizer.step()
 
     def _pixels(self, frames: Tensor) -> Tensor:
@@ -216,23 +236,23 @@ class Learner:
         return (share * probs[:, None, :]).sum(-1)
 
 
-def n_step(rewards: Tensor, discounts: Tensor, valid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def n_step(rewards: Tensor, discounts: Tensor, valid: Tensor, n: int) -> tuple[Tensor, Tensor, Tensor]:
     """The n-step return, the discount and the offset of the state bootstrapped from, [B] each.
 
-    Rewards are summed until `N_STEP` steps are done or the episode is over (srl_jax.rl.losses.n_step).
+    Rewards are summed until n steps are done or the episode is over (srl_jax.rl.losses.n_step).
     """
     r_t = torch.zeros(len(rewards))
     discount_t = torch.ones(len(rewards))
-    for k in range(N_STEP):
+    for k in range(n):
         r_t = r_t + valid[:, k] * discount_t * rewards[:, k]
         discount_t = discount_t * torch.where(valid[:, k] > 0, discounts[:, k], 1.0)
-    return r_t, discount_t, valid[:, :N_STEP].sum(-1).long()
+    return r_t, discount_t, valid[:, :n].sum(-1).long()
 
 
-def _stack_at(frames: Tensor, offset: Tensor, size: int) -> Tensor:
+def _stack_at(frames: Tensor, offset: Tensor, size: int, n: int) -> Tensor:
     """Of each row, the `size` frames from its offset on: uint8 [B, size, H, W]."""
-    if (offset == N_STEP).all():
-        return frames[:, N_STEP : N_STEP + size]
+    if (offset == n).all():
+        return frames[:, n : n + size]
     return frames[torch.arange(len(frames))[:, None], offset[:, None] + torch.arange(size)]
 
 
@@ -240,7 +260,7 @@ class Updates:
     """A preset's update; `check` comes first.
 
     Args:
-        preset: a key of `STRIDES`.
+        preset: a key of `RECIPES`.
         threads: PyTorch's.
         memory_format: "contiguous_format" or "channels_last".
         encoder_optimizer: "separate" or "summed", see `Learner`.
@@ -249,7 +269,7 @@ class Updates:
     def __init__(self, preset: str, threads: int, memory_format: str, encoder_optimizer: str = "separate"):
         torch.set_num_threads(threads)
         torch.manual_seed(0)
-        self._of_side = STRIDES[preset], getattr(torch, memory_format), encoder_optimizer == "separate"
+        self._of_side = RECIPES[preset], getattr(torch, memory_format), encoder_optimizer == "separate"
 
     def check(self, params: dict, window: dict, updates: int) -> list[dict[str, float]]:
         """The losses of the first updates without noise; makes and warms up another learner, which is timed.
@@ -258,7 +278,8 @@ class Updates:
             params, window: see `Learner`.
             updates: how many.
         """
-        checked = Learner(params, window, *self._of_side, noise=False, adam_eps=CHECK_ADAM_EPS)
+        recipe, *others = self._of_side
+        checked = Learner(params, window, recipe._replace(adam_eps=CHECK_ADAM_EPS), *others, noise=False)
         found = [checked.update()[1] for _ in range(updates)]
         self._learner = Learner(params, window, *self._of_side, noise=True)
         self.turn(WARM_UPDATES)
