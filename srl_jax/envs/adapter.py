@@ -26,7 +26,7 @@ def made(id: str, render: bool) -> gymnasium.Env:
 
 
 class Adapter(FrameVectorEnv):
-    """N copies of a gymnasium environment.
+    """N copies of a gymnasium environment, with the wrappers around it: what they show and take counts.
 
     One env step is `frame_skip` steps of the environment with the same action, fewer where it ends; their
     rewards are added, and the last image counts. Images are resized to squares by averaging areas; those that
@@ -82,10 +82,10 @@ class Adapter(FrameVectorEnv):
                 what += " A file is found in the working directory, or by --import=PATH/FILE.py"
             raise ConfigError(f"cannot be made: {what}") from error
         self._grey, self._render, self._skip, self._max_steps = grey, render, frame_skip, max_steps
-        first = self._envs[0].unwrapped
+        first = self._envs[0]
         actions = _actions(first)
         self._colours = 3 if render else _colours(first)
-        names: list[str] = getattr(first, "get_action_meanings", list)()
+        names: list[str] = _attribute(first, "get_action_meanings", list)()
         height, width = (frame_size, frame_size) if frame_size else self._own_size()
         super().__init__(
             num_envs=num_envs,
@@ -94,7 +94,7 @@ class Adapter(FrameVectorEnv):
             action_meanings=names if len(names) == actions.n else map(str, range(actions.n)),
         )
         self._first_action = int(actions.start)
-        self.state_names = tuple(getattr(first, "state_names", ()))
+        self.state_names = tuple(_attribute(first, "state_names", ()))
         self._resize = bool(frame_size)
         self._frames = np.zeros((num_envs, *self.single_observation_space.shape), np.uint8)
         self._states = np.zeros((num_envs, len(self.state_names)), np.float32)
@@ -212,6 +212,11 @@ class Adapter(FrameVectorEnv):
         """Closes the environments."""
         for env in self._envs:
             env.close()
+
+
+def _attribute(env: gymnasium.Env, name: str, default: Any) -> Any:
+    """Of its outermost wrapper that has it, or of the environment inside."""
+    return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else default
 
 
 def _actions(env: gymnasium.Env) -> Discrete:

@@ -69,6 +69,43 @@ def shows(space, shown, **attributes):
     return type("Other", (Square,), {"observation_space": space, "shown": shown, **attributes})
 
 
+class Turns(gymnasium.Env):
+    """Turned by a number; shows a vector of three, and is over once they add up to 2."""
+
+    observation_space = Box(0, 9, (3,))
+    action_space = Box(-1, 1, ())
+    state_names = ("sum",)
+    total = 0.0
+
+    def reset(self, *, seed=None, options=None):
+        self.total = 0.0
+        return np.zeros(3, np.float32), {"state": [self.total]}
+
+    def step(self, action):
+        self.total += float(action)
+        return np.full(3, self.total, np.float32), 0.0, self.total >= 2, False, {"state": [self.total]}
+
+
+def shown_turns():
+    """Turns behind wrappers that make its vector an image, and its action one of three."""
+    seen = gymnasium.wrappers.TransformObservation(
+        Turns(), lambda x: np.full((4, 4), 10 * x[0], np.uint8), Box(0, 255, (4, 4), np.uint8)
+    )
+    return gymnasium.wrappers.TransformAction(seen, lambda action: action / 2, Discrete(3))
+
+
+class Fewer(gymnasium.ActionWrapper):
+    """The right one of a Square's two actions."""
+
+    action_space = Discrete(1)
+
+    def action(self, action):
+        return (6,)[action]
+
+    def get_action_meanings(self):
+        return ["RIGHT"]
+
+
 def make(kind=Square, frame_size=64, num_envs=2, seed=0, **options):
     return envs.adapted(kind, **options).make(num_envs=num_envs, seed=seed, frame_size=frame_size)
 
@@ -190,6 +227,19 @@ def test_pixels_are_means_of_areas():
     # Not square: columns are averaged in pairs, rows in threes.
     tall = np.arange(6 * 4 * 3).reshape(6, 4, 3).astype(np.uint8)
     np.testing.assert_allclose(pixels.averaged(tall, 2), tall.reshape(2, 3, 2, 2, 3).mean((1, 3)))
+
+
+def test_what_the_wrappers_show_and_take_counts():
+    env = make(shown_turns, frame_size=4, num_envs=1)
+    assert env.single_action_space == Discrete(3) and env.state_names == ("sum",)
+    env.reset()
+    frames, _, terminated, _, info = env.step(np.array([2]))
+    assert frames.ravel().tolist() == [10] * 16 and info["state"] == [[1]] and not terminated
+    assert env.step(np.array([2]))[2]
+    env = make(lambda: Fewer(Square()), num_envs=1)
+    assert env.single_action_space == Discrete(1) and env.action_meanings == ("RIGHT",)
+    before = env.reset()[1]["state"]
+    assert env.step(np.array([0]))[4]["state"] == before + 1
 
 
 @pytest.mark.parametrize("moment", MOMENTS)
