@@ -30,8 +30,13 @@ PROTOCOL = (
 )  # fmt: skip
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
-OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", "loggers")
-"""Fields in which runs of one arm and game may differ."""
+OF_A_SEED = (
+    "seed", "encoder_from", "policy_from", "imports", "loggers",
+    "checkpoint_every", "keep_encoder_every", "keep_best", "keep_replay",
+)  # fmt: skip
+"""Fields in which runs of one arm and game may differ: what is theirs alone, and what is written of them
+beside their rows.
+"""
 
 
 def settings(config: Config) -> Iterator[tuple[str, str, str, Any]]:
@@ -263,7 +268,7 @@ def left_out_lines(runs: Sequence[RunData]) -> list[str]:
 
 
 def check_arms(runs: Sequence[RunData]) -> None:
-    """Whether runs of one arm and game differ in nothing but their seed and where its encoder comes from.
+    """Whether runs of one arm and game differ in nothing but `OF_A_SEED`.
 
     Says of an arm whose files of --import were not the same all the time.
 

@@ -99,9 +99,10 @@ def test_what_is_left_out_is_said_in_a_line():
     assert text == "a: 3 of 3 seeds left out: x (seed 0, 2); y (seed 1)"
 
 
-def test_runs_of_an_arm_differ_in_their_seed_alone(tmp_path):
+def test_runs_of_an_arm_differ_in_nothing_that_changes_a_row_but_their_seed(tmp_path):
     write_run(tmp_path / "a/seed0", encoder_from="x/seed0")
-    write_run(tmp_path / "a/seed1", encoder_from="x/seed1", seed=1)
+    kept = {"checkpoint_every": 50, "keep_encoder_every": 1, "keep_best": False, "keep_replay": True}
+    write_run(tmp_path / "a/seed1", encoder_from="x/seed1", seed=1, **kept)
     write_run(tmp_path / "b/seed0", gamma=0.9)
     collect.check_arms(collect.load_runs(tmp_path))
     write_run(tmp_path / "a/seed2", seed=2, gamma=0.9)
