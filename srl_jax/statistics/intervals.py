@@ -22,8 +22,8 @@ class Interval(NamedTuple):
 
     Attributes:
         point: float64, the statistic of the scores themselves.
-        low: float64 of the same shape, the interval's lower limit; NaN where there is none, as with a game
-            that has a single run.
+        low: float64 of the same shape, the interval's lower limit; NaN where there is none: with a game that
+            has a single run, and where no game of any arm has runs that differ.
         high: float64 of the same shape, the upper limit, likewise.
         kind: how it was made: STUDENT, WELCH, STRATIFIED (t, of several groups of runs), BOOTSTRAP, NARROW (a
             bootstrap of fewer than `ENOUGH` runs of some game) or NONE (of a single run).
@@ -118,7 +118,7 @@ def _draw(games: Mapping[str, np.ndarray], repetitions: int, rng: np.random.Gene
 def _interval(point, low, high, *arms: Mapping[str, np.ndarray]) -> Interval:
     fewest = min(x.shape[-1] for arm in arms for x in arm.values())
     kind = NONE if fewest < 2 else NARROW if fewest < ENOUGH else BOOTSTRAP
-    if kind == NONE:
+    if kind == NONE or all((x == x[0]).all() for arm in arms for x in arm.values()):
         low, high = np.full_like(low, np.nan), np.full_like(high, np.nan)
     point, low, high = (np.asarray(x, np.float64) for x in (point, low, high))
     return Interval(point, low, high, kind)

@@ -188,8 +188,8 @@ def test_arms_are_drawn_independently():
 
 def test_equal_arms_are_neither_better_nor_worse():
     same = np.full((4, 2), 0.3)
-    assert bootstrap(probability_of_improvement, same, same)[:3] == (0.5, 0.5, 0.5)
-    assert bootstrap_difference(same, same)[:3] == (0, 0, 0)
+    assert bootstrap(probability_of_improvement, same, same).point == 0.5
+    assert bootstrap_difference(same, same).point == 0
 
 
 @given(order=st.permutations(range(6)), seed=st.integers(0, 100))
@@ -356,6 +356,21 @@ def test_the_interquartile_mean_of_many_different_numbers_of_runs():
     assert interquartile_mean({str(n): np.full(n, 2.5) for n in range(3, 44)}) == pytest.approx(
         2.5, rel=1e-12
     )
+
+
+def test_runs_that_are_all_alike_have_no_interval():
+    alike, other = {"g": [1.0] * 3, "h": [2.0] * 5}, {"g": [0.0] * 2, "h": [2.0] * 2}
+    for found in (
+        estimate(interquartile_mean, {"g": [1, 1, 1]}),
+        estimate(median, alike),
+        estimate(probability_of_improvement, alike, other),
+        estimate_difference(alike, other, median),
+        bootstrap(partial(performance_profile, thresholds=[0.5, 1.5]), alike),
+    ):
+        assert np.isfinite(found.point).all() and np.isnan(found[1:3]).all()
+    # One run of one game that differs is enough.
+    assert estimate(median, {"g": [1.0] * 3, "h": [2.0, 2.0, 4.0]}).low == 1.5
+    assert estimate(probability_of_improvement, alike, other | {"h": [1.0, 2.0]}).high == 1
 
 
 def test_a_single_run_has_no_interval():
