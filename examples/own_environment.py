@@ -1,7 +1,7 @@
 """An environment of your own, 64 x 64 pixels in colour: a red dot has to be led to a green place.
 
     python -m experiments.train --game=examples.own_environment:Dot-v0 --frame_size=84 \
-        --encoder=tiny --steps=20000 --out=runs/dot
+        --encoder=tiny --steps=20000 --eps_anneal_steps=10000 --eval_every=2000 --out=runs/dot
 
 `module:Name-v0` imports the module, which registers the environment with gymnasium. Frames are resized to
 `--frame_size`; `--game=examples.own_environment:Dot-v0,grey=true,frame_skip=2` has more options. Since the
