@@ -17,11 +17,11 @@ import pdoc
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-# `srl_jax` brings what its `__all__` names: `losses`, `objectives`, `encoders`, `envs`.
+# `srl_jax` brings what its `__all__` names: `data`, `losses`, `objectives`, `encoders`, `envs`, `statistics`.
 PUBLIC = (
     "srl_jax.rl", "!srl_jax.rl.losses", "srl_jax", "srl_jax.types", "srl_jax.loading",
     "srl_jax.learning.update", "srl_jax.learning.modes", "srl_jax.layers", "srl_jax.augment",
-    "srl_jax.statistics", "srl_jax.diagnostics", "srl_jax.plugins", "srl_jax.errors",
+    "srl_jax.diagnostics", "srl_jax.plugins", "srl_jax.errors",
 )  # fmt: skip
 
 
