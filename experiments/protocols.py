@@ -22,7 +22,8 @@ PROTOCOLS: dict[str, dict[str, Any]] = {
     # google/dopamine, labs/atari_100k: configs/DER.gin, eval_run_experiment.py (no-ops below 30, 100 games).
     # Kaixhin/Rainbow, env.py, and google-research, bbf/configs/BBF.gin, start and end games likewise.
     "dopamine_100k": _COMMON,
-    # mila-iqia/spr, src/rlpyt_atari_env.py (1 to 30 no-ops) and src/utils.py (100 games in 100 environments).
+    # mila-iqia/spr, src/rlpyt_atari_env.py (1 to 30 no-ops; 31 is 0 to 30) and src/utils.py (100 games in 100
+    # environments).
     "spr_100k": {**_COMMON, "noop_max": 31},
     # Guberina & Desta (2022), table 5.1 and its code: what Config's defaults are.
     "thesis": {**_COMMON, "eps_eval": 0.005, "final_games": 0},
