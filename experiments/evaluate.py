@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from absl import flags
 
-from srl_jax.errors import ConfigError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display
 from srl_jax.files.checkpoint import Manifest
 from srl_jax.specs import Info
@@ -117,11 +117,12 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
         "returns": played.returns,
         "lengths": played.lengths,
     }
+    display.result(json.dumps(result))
     if values.gif:
         from .drawing import images
 
-        images.gif(played.frames[: played.lengths[0] + 1], values.gif)  # the first game
-    display.result(json.dumps(result))
+        with saving(f"--gif={values.gif}"):
+            images.gif(played.frames[: played.lengths[0] + 1], values.gif)  # the first game
 
 
 def define_flags(values: flags.FlagValues) -> None:

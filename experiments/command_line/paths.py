@@ -1,7 +1,9 @@
 """Paths that flags name, checked before anything is written. Imports no jax."""
 
 import contextlib
+import errno
 import os
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -30,7 +32,19 @@ def _no_place(path: Path) -> str:
     parent = next(p for p in path.absolute().parents if os.path.lexists(p))
     if not parent.is_dir():
         return f"{parent} is not a directory"
-    return "" if os.access(parent, os.W_OK | os.X_OK) else f"no permission to write in {parent}"
+    return _closed(parent)
+
+
+def _closed(directory: Path) -> str:
+    """Why nothing can be made in a directory, or ""; tries it with a file without a name."""
+    if not os.access(directory, os.W_OK | os.X_OK):
+        return f"no permission to write in {directory}"
+    try:
+        tempfile.TemporaryFile(dir=directory).close()
+    except OSError as error:
+        if error.errno not in (errno.ENOSPC, errno.EDQUOT):  # who writes tells of a full disk
+            return f"nothing can be made in {directory}: {error.strerror}"
+    return ""
 
 
 def check_file(
@@ -64,10 +78,10 @@ def check_file(
                 return f"{name}exists; name a new file{hint}"
             if there and not file.is_file():
                 return f"{name}exists and is not a file"
-        if deep:
-            why = _no_place(path.parent)
-            return f"{path.parent}: {why}" if why else ""
-        return "" if path.absolute().parent.is_dir() else "no such directory"
+        if path.absolute().parent.is_dir():
+            return _closed(path.absolute().parent)
+        why = _no_place(path.parent) if deep else ""
+        return f"{path.parent}: {why}" if why else "" if deep else "no such directory"
 
     return _checked(flag, text, problem)
 

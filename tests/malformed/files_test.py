@@ -1,5 +1,6 @@
 """Files and folders in whose place lies everything that is none, or is none of ours, and names of nothing."""
 
+import errno
 import json
 import os
 import pickle
@@ -8,6 +9,7 @@ import socket
 
 import pytest
 
+from experiments.drawing import images
 from srl_jax.files import checkpoint
 from tests.malformed.conftest import CODE, DRAW, EVALUATE, GIVEN, OVERWRITE, START, TRAIN, call
 
@@ -249,8 +251,20 @@ def test_where_a_gif_cannot_lie(refused, source, full, folder):
     (folder / "folder.gif").mkdir()
     (folder / "link.gif").symlink_to("nowhere")
     gifs = ("a.png", "gif", ".gif", "none/a.gif", "file/a.gif", "old.gif", "folder.gif", "link.gif")
+    gifs += ("/proc/a.gif",)
     for text in (*gifs, *(f"{name}.gif" for name in LONG[:2]), "a\nb.gif"):
         refused(*EVALUATE, f"--gif={text}", names="--gif")
+
+
+def test_a_gif_that_is_not_written_is_one_line_and_the_scores_are_there(source, folder, capsys, monkeypatch):
+    def full(*_):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(images, "gif", full)
+    assert call(*EVALUATE, "--gif=a.gif") == 3
+    printed = capsys.readouterr()
+    assert printed.err == "error: --gif=a.gif: not written: No space left on device\n"
+    assert len(json.loads(printed.out)["returns"]) == 1
 
 
 # What is not malformed
