@@ -42,7 +42,7 @@ def command_line(run: str) -> list[str]:
         raise ConfigError(
             f"{run}: runs of a sweep, each by itself; name one of them, or give srl-jax sweep --out={root}"
         )
-    numbers = ",".join(name.removeprefix("seed") for name in seeds)
+    numbers = ",".join(name.removeprefix("seed") for name in seeds) + ","[: len(seeds) == 1]
     return [f"--config={path / seeds[0] / 'config.json'}", f"--seeds={numbers}", *goes_on]
 
 

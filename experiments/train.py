@@ -50,8 +50,8 @@ def define_flags(values: flags.FlagValues) -> None:
     text(
         "seeds",
         None,
-        "several seeds in this process, 0,1,2, instead of --seed: for an accelerator; a run directory each "
-        "in --out, seed0, seed1, ...",
+        "which seeds, 0,1,2 or 3, alone, in this process, instead of --seed: for an accelerator; a run "
+        "directory each in --out, seed0, seed1, ...",
     )
     flags.DEFINE_enum(
         "resume",
@@ -140,7 +140,8 @@ def check_seeds(values: flags.FlagValues) -> list[int]:
     """The seeds of --seeds; none where it was not given.
 
     Raises:
-        ConfigError: they are not distinct integers, or --seed was given beside them.
+        ConfigError: they are not distinct integers, or one without a comma, which elsewhere is how many; or
+            --seed was given beside them.
     """
     text = values["seeds"].value
     if text is None:
@@ -148,13 +149,18 @@ def check_seeds(values: flags.FlagValues) -> list[int]:
     if values["seed"].present:
         raise ConfigError(f"--seeds={text}: given beside --seed={values['seed'].value}; give one of them")
     try:
-        seeds = [INFOS["seed"].parse(part) for part in text.split(",")]
+        seeds = [INFOS["seed"].parse(part) for part in text.removesuffix(",").split(",")]
         for seed in seeds:
             INFOS["seed"].check(seed)
     except ValueError as error:
         raise ConfigError(f"--seeds={text}: {error}; give integers, as in --seeds=0,1,2") from None
     if len(set(seeds)) < len(seeds):
         raise ConfigError(f"--seeds={text}: a seed is there twice")
+    if "," not in text:
+        raise ConfigError(
+            f"--seeds={text}: names which seeds, not how many; --seeds=0,1,2 are three, --seed={text} is a "
+            f"run of that one, and --seeds={text}, (with the comma) is that one in a directory of seeds"
+        )
     return seeds
 
 

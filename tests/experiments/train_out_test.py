@@ -47,7 +47,7 @@ def test_overwriting_that_the_loop_refuses_leaves_the_old_run(capsys, loop, tmp_
 
 
 @pytest.mark.parametrize("begun", [False, True])
-@pytest.mark.parametrize("flag", ["--overwrite", "--resume=auto", "--overwrite --seeds=1", "--seeds=1"])
+@pytest.mark.parametrize("flag", ["--overwrite", "--resume=auto", "--overwrite --seeds=1,", "--seeds=1,"])
 def test_a_seed_that_a_process_holds_is_not_deleted(capsys, loop, tmp_path, flag, begun):
     seed = tmp_path / "run/seed0"
     train_in_process(*CATCH, f"--out={seed}")
@@ -108,8 +108,8 @@ def test_a_directory_holds_a_single_run_or_seeds(capsys, loop, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "left"),
     [
-        (["--seeds=2"], {"seed2"}),
-        (["--seeds=0", "--resume=auto"], {"seed0"}),
+        (["--seeds=2,"], {"seed2"}),
+        (["--seeds=0,", "--resume=auto"], {"seed0"}),
         (["--resume=auto"], {"config.json", "metrics.jsonl"}),
         ([], {"config.json", "metrics.jsonl"}),
     ],

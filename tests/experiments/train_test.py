@@ -313,6 +313,9 @@ def test_resume_finds_the_seeds_of_a_process(loop, tmp_path):
         f"--config={tmp_path}/runs/seed2/config.json", "--seeds=2,10", f"--out={tmp_path}/runs",
         "--resume=auto",
     ]  # fmt: skip
+    train_in_process(*CATCH, "--seeds=3,", f"--out={tmp_path}/one")
+    train_in_process(*resume.command_line(f"{tmp_path}/one"))
+    assert loop.seeds[-1] == [3] and loop.calls[-1][1] == tmp_path / "one/seed3"
 
 
 def test_resume_refuses_what_is_no_run(tmp_path):

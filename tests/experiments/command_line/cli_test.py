@@ -159,6 +159,8 @@ BAD = [
     (["--seeds=1,b"], "--seeds=1,b", "not a whole number; give integers"),
     (["--seeds=0,-1"], "--seeds=0,-1", "at least 0"),
     (["--seeds="], "--seeds=", "give integers"),
+    (["--seeds=3"], "--seeds=3", "not how many; --seeds=0,1,2 are three, --seed=3 is a run of that one"),
+    (["--seeds=3"], "--seeds=3", ", and --seeds=3, (with the comma) is that one in a directory of seeds"),
     (["--seeds=0,1", "--seed=2"], "--seeds=0,1", "--seed=2; give one of them"),
     (["--tune_runtime=x"], "--tune_runtime=x", "valid: auto, off"),
     (["--steps"], "--steps", ""),
