@@ -34,6 +34,7 @@ from srl_jax.files.resuming import (
 )
 from srl_jax.files.rundir import LOCK, check_free, put_back, run_directory
 from srl_jax.learning.modes import MODES
+from srl_jax.specs import value_text
 from srl_jax.training import check_game, check_sources, completed, resolved
 
 from .command_line import flags as config_flags
@@ -181,6 +182,18 @@ def say_last_evaluation(config: Config) -> None:
         display.say(f"--eval_every={every}: the last evaluation is after {last:,} of {end:,} env steps")
 
 
+def say_no_update(config: Config) -> None:
+    """A line where the run ends before its first update is due; imports jax."""
+    from srl_jax.learning.update import Hyper
+    from srl_jax.run.schedules import Schedules
+
+    last = config.whole_rounds(config.steps) - config.num_envs  # where the last round begins
+    if not Schedules(config, Hyper({}, {})).updates_due(last):
+        name = "learn_start" if last < config.learn_start else "updates_per_step"
+        value = value_text(getattr(config, name))
+        display.say(f"--{name}={value}: no update is due within {config.steps:,} env steps")
+
+
 def check_paths(config: Config) -> None:
     """Whether the paths that the run starts from exist.
 
@@ -273,6 +286,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         started = contextlib.ExitStack()  # what is to be done once the run has begun
         if not manifests[0]:
             started.callback(say_last_evaluation, config)
+            started.callback(say_no_update, config)
         if seeds and fresh:
             started.callback(stack.enter_context(run_directory(path, None)))
         for (directory, its_config), manifest in zip(runs, manifests, strict=True):

@@ -391,6 +391,23 @@ def test_a_last_evaluation_before_the_end_is_said(capsys, loop, tmp_path, flags,
     assert (f"the last evaluation is after {last} env steps" in capsys.readouterr().err) == bool(last)
 
 
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        # Ten environments: the last round of 300 begins at 290, and its ten steps have one update.
+        (["--learn_start=1000"], "--learn_start=1000: no update is due within 300 env steps"),
+        (["--learn_start=291"], "--learn_start=291: no update"),
+        (["--learn_start=290", "--updates_per_step=0.1"], ""),
+        (["--learn_start=290", "--updates_per_step=0.09"], "--updates_per_step=0.09: no update"),
+        (["--learn_start=32", "--updates_per_step=1e-9"], "--updates_per_step=1e-09: no update"),
+    ],
+)
+def test_a_run_without_an_update_is_said(capsys, loop, tmp_path, flags, says):
+    train_in_process("--preset=catch/rl_only", "--steps=300", *flags, f"--out={tmp_path}/a")
+    said = capsys.readouterr().err
+    assert says in said and ("no update is due" in said) == bool(says)
+
+
 def test_a_game_that_cannot_be_made_leaves_nothing(capsys, loop, tmp_path):
     with pytest.raises(SystemExit):
         train_in_process("--game=nonesuch_module:E-v0", f"--out={tmp_path}/a")

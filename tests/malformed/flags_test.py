@@ -78,7 +78,8 @@ def test_flags_that_there_are_not(refused):
 
 def test_seeds_and_presets_that_there_are_not(refused):
     seeds = (
-        "", ",", "1", ",1", "1,,", "1,,2", "1;2", "0,0", "-1", "1.5", "nan", "2147483648", "9" * 400, "a", CODE,
+        "", ",", "1", ",1", "1,,", "1,,2", "1;2", "0,0", "-1", "1.5", "nan", "2147483648", "9" * 400, "a",
+        CODE,
     )  # fmt: skip
     for text in seeds:
         refused(*TRAIN, f"--seeds={text}", names="--seeds")
