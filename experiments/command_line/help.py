@@ -1,5 +1,6 @@
 """What --help prints: a program's flags in groups, with the rows of the registries and the presets."""
 
+import re
 import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -10,6 +11,7 @@ from absl import flags
 from srl_jax import specs
 from srl_jax.files import display
 
+from .. import PACKAGE
 from ..presets import OBJECTIVE, PIECES, PIECES_HELP, PRESETS, summary
 from ..protocols import PROTOCOLS
 
@@ -55,13 +57,17 @@ def text(about: str, values: flags.FlagValues) -> str:
         about: what the program does; its first lines are shown.
         values: where its flags are defined. Where --rl is among them, jax is imported for what it may be.
     """
+    from .cli import COMMANDS  # which imports this module
+
     own = own_flags(values)
     trains = "rl" in own
     grouped = {title: names.split() for title, names in GROUPS.items()} if trains else {}
     known = {name for names in grouped.values() for name in names}
     grouped = {"Flags": [name for name in own if name not in known]} | grouped
     rows = _rows() if trains else {}
-    lines = [about.strip().replace("python -m experiments.", "srl-jax "), ""]
+    commands = rf"python -m experiments\.({'|'.join(COMMANDS)})\b"
+    about = re.sub(commands, r"srl-jax \1", about.strip())
+    lines = [about.replace("python -m experiments.", f"python -m {PACKAGE}."), ""]
     for title, names in grouped.items():
         shown = [(*_flag(name, values), *_listed(rows.get(name, {}))) for name in names if name in own]
         if shown:

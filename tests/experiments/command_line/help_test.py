@@ -7,7 +7,7 @@ import sys
 import pytest
 from absl import flags
 
-from experiments import sweep, train
+from experiments import reference_policies, sweep, train
 from experiments.command_line import flags as config_flags
 from experiments.command_line import help
 from experiments.command_line.cli import COMMANDS
@@ -85,6 +85,14 @@ def test_every_command_says_what_it_does_first(name):
     module = importlib.import_module(f"experiments.{COMMANDS[name].module or name}")
     first = help.text(module.__doc__, flags.FlagValues()).splitlines()[0]
     assert f"`srl-jax {name}" in first or name == "figures"
+
+
+def test_what_is_no_command_is_called_as_the_module_that_it_is():
+    about = "`python -m experiments.power`, `python -m experiments.powers.x`"
+    told = help.text(about, flags.FlagValues())
+    assert told == "`srl-jax power`, `python -m experiments.powers.x`"
+    first = help.text(reference_policies.__doc__, flags.FlagValues())
+    assert "\n    python -m experiments.reference_policies --games=" in first
 
 
 def test_help_ends_with_status_0():
