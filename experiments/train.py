@@ -272,6 +272,10 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
         if config.reset != "none" or config.n_anneal or config.gamma_anneal:
             for line in printed(config, every=max(1, config.steps // 20)):
                 display.say(line)
+        say_unused(values, config.game)
+        if not manifests[0]:
+            say_last_evaluation(config)
+            say_no_update(config)
         for (directory, _), manifest in zip(runs, manifests, strict=True):
             how = f"would resume from {manifest.env_steps} env steps" if manifest else "would begin"
             display.say(f"dry run: nothing is written; a run {how} in {directory}")

@@ -8,6 +8,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.learning import annealing
 from srl_jax.learning.modes import MODES, PROJECTING, Mode, both_train, of, ratios, two_optimizers
 from srl_jax.needs import EVERYTHING, UNKNOWN, Run
+from srl_jax.replay import least_capacity
 
 if TYPE_CHECKING:
     from srl_jax.config import Config
@@ -264,6 +265,25 @@ def check(
     _check_corrupted(config)
     _check_ratios(config)
     return config
+
+
+def check_replay(config: "Config", horizon: int) -> None:
+    """Whether replay has room for the windows of a run; allocates nothing.
+
+    Args:
+        config: the run's.
+        horizon: of the windows, in steps.
+
+    Raises:
+        ConfigError: it has not.
+    """
+    least = least_capacity(config.num_envs, config.frame_stack, horizon)
+    if config.buffer_size < least:
+        raise ConfigError(
+            f"--buffer_size={config.buffer_size}: must be at least {least}; --num_envs={config.num_envs}, "
+            f"--frame_stack={config.frame_stack} and the {horizon} steps ahead that "
+            f"--rl={specs.split(config.rl)[0]}:n_step= or --objective looks say how much it takes"
+        )
 
 
 def _check_terminal(config: "Config") -> None:

@@ -85,12 +85,12 @@ def resolved(config: Config, given: Collection[str] = ()) -> Config:
 
     Raises:
         ConfigError: what is to be imported cannot be, or a specification is not valid, or cannot be built for
-            these frames, or there is no such view, or a logger's package is missing, or nothing reads what
-            was given.
+            these frames, or replay has no room for a window, or there is no such view, or a logger's package
+            is missing, or nothing reads what was given.
     """
     from srl_jax.augment import Views
     from srl_jax.files import loggers
-    from srl_jax.learning.agent import components
+    from srl_jax.learning.agent import components, trained_terms
 
     if config.imports:
         plugins.load(config.imports)
@@ -100,7 +100,8 @@ def resolved(config: Config, given: Collection[str] = ()) -> Config:
     # Options may be valid one by one and not together, or not for these frames: only a factory knows. An
     # environment's own size and its number of actions are known once it is made; any will do for that.
     size = config.frame_size or 84
-    _, _, terms = components(config, (size, size, 1), num_actions=18)
+    _, algorithm, terms = components(config, (size, size, 1), num_actions=18)
+    checks.check_replay(config, trained_terms(config, algorithm, terms)[1])
     Views.of(config)
     refuse_unread(config, full, terms, given)
     return full

@@ -47,7 +47,7 @@ def test_a_run_is_trained_into_a_new_directory_and_loaded(tmp_path):
         ({"loggers": ("csvv",)}, "--logger=csvv: no 'csvv'; did you mean csv"),
         ({"game": "no_module_here:Game-v0"}, "--game=no_module_here:Game-v0: "),
         ({"mode": "frozen", "encoder_from": "nowhere"}, "--encoder_from=nowhere: "),
-        ({"buffer_size": 35, "learn_start": 8}, "--buffer_size=35: capacity must be at least 36"),
+        ({"buffer_size": 35, "learn_start": 8}, "--buffer_size=35: must be at least 36"),
     ],
 )
 def test_what_cannot_be_run_is_refused_and_leaves_nothing(values, message, tmp_path):

@@ -182,6 +182,22 @@ def components(
     return encoder, algorithm, terms
 
 
+def trained_terms(
+    config: Config, algorithm: Algorithm, terms: Mapping[str, Objective]
+) -> tuple[dict[str, Objective], int]:
+    """What a run trains by name, RL first, and the horizon of the windows that all of it reads, in steps.
+
+    Args:
+        config: the run's.
+        algorithm, terms: its `components`.
+    """
+    mode = modes.of(config)
+    found = dict(terms) if mode.representation else {}
+    if mode.rl:
+        found = {RL: algorithm.objective._replace(slow=algorithm.slow(config.slow_update_every)), **found}
+    return found, max(1, *(term.horizon for term in found.values()))
+
+
 def check_losses(
     agent: Agent, terms: Mapping[str, Objective], config: Config, frame_shape: tuple[int, int, int]
 ) -> None:
@@ -266,10 +282,7 @@ def make_agent(
     """
     mode, views = modes.of(config), Views.of(config)
     encoder, algorithm, terms = components(config, frame_shape, num_actions)
-    if not mode.representation:
-        terms = {}
-    if mode.rl:
-        terms = {RL: algorithm.objective._replace(slow=algorithm.slow(config.slow_update_every)), **terms}
+    terms, horizon = trained_terms(config, algorithm, terms)
     optimizer = make_optimizer(
         terms,
         decoder_weight_decay=config.decoder_weight_decay,
@@ -300,7 +313,7 @@ def make_agent(
         encoder=encoder,
         algorithm=algorithm,
         objectives=terms,
-        horizon=max(1, *(o.horizon for o in terms.values())),
+        horizon=horizon,
         # It runs once: compile it fast.
         init=jax.jit(init, compiler_options={"xla_backend_optimization_level": 0}),
         update=jitted_update(plan),

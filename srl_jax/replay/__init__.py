@@ -30,6 +30,11 @@ PRIORITY_EPSILON = 1e-6
 """Added to |TD error|, so that every transition keeps a chance (Schaul et al. 2016, sec. 3.3)."""
 
 
+def least_capacity(num_streams: int, stack: int, horizon: int) -> int:
+    """The fewest transitions that a `Replay` can have room for; a stream has to hold a window."""
+    return num_streams * (stack + horizon + 2)  # a window, the slot being written, one spare
+
+
 def _check(name, array, shape, dtype):
     """The array, if it has this shape and its numbers all fit this dtype."""
     array = np.asarray(array)
@@ -97,7 +102,7 @@ class Replay:
         Raises:
             ValueError: an argument is out of range, or there are too few slots for a window.
         """
-        least = num_streams * (stack + horizon + 2)  # a window, the slot being written, one spare
+        least = least_capacity(num_streams, stack, horizon)
         for holds, message in (
             (num_streams >= 1, f"num_streams must be at least 1, got {num_streams}"),
             (1 <= stack <= 256, f"stack must lie in [1, 256], got {stack}"),

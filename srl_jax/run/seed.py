@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from srl_jax import specs
+from srl_jax.checks import check_replay
 from srl_jax.config import Config, difference
 from srl_jax.diagnostics.run import Diagnostics
 from srl_jax.errors import ConfigError
@@ -47,6 +47,7 @@ class Seed:
         self.config, self.out, self.agent, self.env = config, out, agent, env
         self.key = jax.random.key(config.seed)
         frame = env.single_observation_space.shape
+        check_replay(config, agent.horizon)
         try:
             self.replay = Replay(
                 capacity=config.buffer_size,
@@ -58,12 +59,8 @@ class Seed:
                 alpha=agent.algorithm.alpha if agent.mode.rl else 0.0,
                 seed=seed_for(config.seed, "replay"),
             )
-        except (ValueError, MemoryError) as error:
-            raise ConfigError(
-                f"--buffer_size={config.buffer_size}: {error}; --num_envs={config.num_envs}, "
-                f"--frame_stack={config.frame_stack} and the {agent.horizon} steps ahead that "
-                f"--rl={specs.split(config.rl)[0]}:n_step= or --objective looks say how much it takes"
-            ) from None
+        except MemoryError as error:
+            raise ConfigError(f"--buffer_size={config.buffer_size}: {error}; give fewer") from None
         self.stacks = FrameStack(config.num_envs, config.frame_stack, frame)
         self.score = np.zeros(config.num_envs)  # of the training episodes so far
         self.rng = np.random.default_rng(seed_for(config.seed, "random policy"))

@@ -442,5 +442,14 @@ def test_a_dry_run_says_what_would_be_done_and_writes_nothing(capsys, loop, tmp_
     assert train_in_process(*CATCH, "--dry_run", f"--out={out}", "--resume=auto") == 0
     assert f"a run would resume from 200 env steps in {out}\n" in capsys.readouterr().err
     assert "not empty" in refused(capsys, *CATCH[1:], "--dry_run", f"--out={out}")
-    assert "no 'rainbwo'" in refused(capsys, "--rl=rainbwo", "--dry_run", f"--out={tmp_path}/new")
+    new = ["--dry_run", f"--out={tmp_path}/new"]
+    assert "no 'rainbwo'" in refused(capsys, "--rl=rainbwo", *new)
+    # Ten environments of 4 frames, 10,000 steps ahead, the slot that is written and one to spare.
+    assert "--buffer_size=100000: must be at least 100060; " in refused(capsys, "--rl=:n_step=10000", *new)
+    assert "--out=/proc/x: nothing can be made in /proc: " in refused(capsys, "--dry_run", "--out=/proc/x")
+    told = ["--steps=500", "--eval_every=400", "--sticky_actions=0.25", "--learn_start=600"]
+    train_in_process("--preset=catch/rl_only", *told, *new)
+    said = capsys.readouterr().err
+    assert "--sticky_actions: changes nothing" in said and "--learn_start=600: no update" in said
+    assert "--eval_every=400: the last evaluation is after 400 of 500" in said
     assert sorted((p, p.stat().st_mtime_ns) for p in tmp_path.rglob("*")) == before and len(loop.calls) == 1
