@@ -41,7 +41,7 @@ from .runs import collect, scores
 from .runs.collect import FINAL, RunData, comparable, steps_and_returns, steps_and_values
 from .runs.json_values import limits, plain
 from .sweeping import launching, manifest, options, probe, status
-from .sweeping.plan import Arm, Planned, parse_seeds, plan
+from .sweeping.plan import OWN, Arm, Planned, parse_seeds, plan
 from .sweeping.plan import presets as matching
 
 TWO = 2
@@ -284,7 +284,10 @@ def run(values: flags.FlagValues) -> int:
         parse_seeds(values["seeds"].value),
         envs.several(values["games"].value, others=bool(values["import"].value)),
     )
-    runs = planned(figures, games, seeds, options.given_flags(values))
+    given = options.given_flags(values)
+    if arms := [flag for flag, mine in OWN.items() if mine == "presets" and flag in given and not of_scores]:
+        raise ConfigError(f"--{arms[0]}: the figure's arms decide it; a JSON file names arms of your own")
+    runs = planned(figures, games, seeds, given)
     options.say_what_is_replaced(values, runs)
     text = values["published"].value
     if of_scores:

@@ -34,6 +34,9 @@ GROUPS: dict[str, str] = {
 }
 """Flags of training, in the order in which they are shown; others are a program's own."""
 
+HIDDEN = "not taken here"
+"""The help of a flag that is not shown."""
+
 _INDENT = " " * 26
 
 
@@ -59,7 +62,7 @@ def text(about: str, values: flags.FlagValues) -> str:
     """
     from .cli import COMMANDS  # which imports this module
 
-    own = own_flags(values)
+    own = [name for name in own_flags(values) if values[name].help != HIDDEN]
     trains = "rl" in own
     grouped = {title: names.split() for title, names in GROUPS.items()} if trains else {}
     known = {name for names in grouped.values() for name in names}

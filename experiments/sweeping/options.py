@@ -11,6 +11,7 @@ from srl_jax.files import display
 from srl_jax.specs import Info, value_text
 
 from ..command_line import flags as config_flags
+from ..command_line import help
 from ..presets import preset_values
 from . import plan
 
@@ -27,6 +28,8 @@ def define_flags(values: flags.FlagValues) -> None:
     """Defines the flags of training that a sweep gives to its runs, and those that say how runs are run."""
     text, yes, *_ = config_flags.kinds(values)
     config_flags.define_config_flags(values)
+    for name in plan.OWN:  # defined to be refused with a reason
+        values[name].help = help.HIDDEN
     config_flags.define_runtime_flag(values)
     launchers = "who runs the runs: this machine, or a Ray cluster"
     flags.DEFINE_enum("launcher", "local", ["local", "ray"], launchers, values)

@@ -38,7 +38,7 @@ def test_overwriting_that_the_loop_refuses_leaves_the_old_run(capsys, loop, tmp_
     def refuse(config, out, **_):
         assert not (out / "metrics.jsonl").exists()  # it would append to the old one's
         (out / "metrics.jsonl").touch()
-        raise ConfigError("--buffer_size=70: capacity must be at least 90")
+        raise ConfigError("--buffer_size=70: must be at least 90")
 
     monkeypatch.setattr(loop, "train", refuse)
     before = sorted((p, p.stat().st_mtime_ns) for p in out.rglob("*") if p.is_file())

@@ -1,13 +1,14 @@
 """experiments/command_line/help.py: what --help prints."""
 
 import importlib
+import re
 import subprocess
 import sys
 
 import pytest
 from absl import flags
 
-from experiments import reference_policies, sweep, train
+from experiments import figures, reference_policies, sweep, train
 from experiments.command_line import flags as config_flags
 from experiments.command_line import help
 from experiments.command_line.cli import COMMANDS
@@ -66,6 +67,15 @@ def test_every_preset_has_a_line():
 def test_a_programs_own_flags_come_first():
     page = _text(sweep)
     assert page.index("\nFlags:\n") < page.index("  --grid") < page.index("\nRun:\n")
+
+
+@pytest.mark.parametrize("module", [sweep, figures])
+def test_what_a_sweep_gives_to_each_run_is_not_shown(module):
+    page = _text(module)
+    for name in ("game", "seed", "preset", "config", "encoder_from", "policy_from"):
+        assert re.search(rf"^  --{name}\b", _text(train), re.M)
+        assert not re.search(rf"^  --{name}\b", page, re.M)
+    assert "\n  --heads_from=" in page and "\n  --games" in page and help.HIDDEN not in page
 
 
 @pytest.mark.parametrize("given", ["--verbosity=1", "--verbosit=1"])
