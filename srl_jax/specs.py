@@ -277,7 +277,7 @@ class Info(NamedTuple):
         Raises:
             ValueError: a reason that follows the text.
         """
-        if self.optional and text.strip().lower() in ("off", "none", "nan"):
+        if self.optional and text.strip().lower() in ("off", "none"):
             return None
         try:
             value = parse_value(text, str if self.kind is tuple else self.kind)

@@ -22,9 +22,8 @@ def wrong(info):
         return ["", "x", CODE, f"{first}\nx", f"{first}\u0301", "x" * 5000]
     if info.kind not in (int, float):
         return []
-    texts = ["", "abc", CODE, "1\n2", "inf", "1e400", "9" * 400]
+    texts = ["", "abc", CODE, "1\n2", "inf", "nan", "1e400", "9" * 400]
     texts += ["1.5", str(2**31), "0x10"] if info.kind is int else ["1e39", "1+1j"]
-    texts += [] if info.optional else ["nan"]
     least = info.minimum if info.minimum is not None else info.above
     texts += [] if least is None else [f"{least - 1:.10g}"]
     return texts + ([] if info.maximum is None else [f"{info.maximum + 1:.10g}"])
