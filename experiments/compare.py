@@ -75,8 +75,10 @@ def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[
             f"{roots[0]}: one curve; name a second run, or a folder of several; srl-jax draw draws one run"
         )
     runs = [run for members in found for run in members]
-    known = {name for run in runs for row in run.rows for name in row} - {*LEADING[:2]}
+    rows = [row for run in runs for row in run.rows]
+    known = {name for row in rows for name in row} - {*LEADING[:2]}
     if key not in known:
+        known -= {name for row in rows for name, x in row.items() if not isinstance(x, int | float | None)}
         near = specs.near(key, known) or sorted(known)
         raise ConfigError(f"--key={key}: no run has it; there are {', '.join(near)}")
     if len(games := dict.fromkeys(run.game for run in runs)) > 1 and not force:

@@ -415,7 +415,7 @@ def _names(text: str, known: Iterable[str]) -> list[str]:
         return [text.strip()]
     for name in names:
         if name not in known:
-            raise ConfigError(f"--published={text}: {choices_text(name, known)}")
+            raise ConfigError(f"--published={text}: {choices_text(name, known, '; ')}")
     return names
 
 

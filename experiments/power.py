@@ -60,7 +60,11 @@ def of_runs(root: Path, only: str | None = None, *, force: bool = False) -> dict
     Raises:
         ConfigError: there are no runs, no arm has enough of them, or they are unlike.
     """
-    runs = [run for run in collect.load_runs(root) if collect.has_policy(run) and only in (None, run.game)]
+    try:
+        there = collect.load_runs(root)
+    except ConfigError as error:
+        raise ConfigError(f"--from={root}: {str(error).removeprefix(f'{root}: ')}") from None
+    runs = [run for run in there if collect.has_policy(run) and only in (None, run.game)]
     collect.check_arms(runs)
     for line in collect.check_protocols(runs, force=force) + collect.left_out_lines(runs):
         display.say(line)

@@ -78,17 +78,17 @@ class Spec:
         return dataclasses.replace(self, options=options, resolved={**self.defaults, **options})
 
 
-def choices_text(given: str, names: Iterable[str]) -> str:
+def choices_text(given: str, names: Iterable[str], between: str = ", ") -> str:
     """`did you mean X? valid: ...`; suggests only where a name is near (letter case aside).
 
-    Of more than 20 names, which nobody would read, only the near ones are listed.
+    Of more than 20 names, which nobody would read, only the near ones are listed; `between` is between two.
     """
     names = sorted(names) if isinstance(names, Set) else list(names)
     close = near(given, names)
     suggestion = f"did you mean {close[0]}? " if close else ""
     if close and len(names) > 20:
-        return f"{suggestion}near: {', '.join(close)}; {len(names)} are valid"
-    return f"{suggestion}valid: {', '.join(names)}"
+        return f"{suggestion}near: {between.join(close)}; {len(names)} are valid"
+    return f"{suggestion}valid: {between.join(names)}"
 
 
 def near(given: str, names: Iterable[str], most: int = 5) -> list[str]:

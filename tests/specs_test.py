@@ -179,6 +179,7 @@ def test_names_that_may_have_been_meant():
     # A set has an order of its own in each process.
     assert specs.choices_text("q", {"b", "a", "c"}) == "valid: a, b, c"
     assert specs.choices_text("q", ["b", "a"]) == "valid: b, a"
+    assert specs.choices_text("q", ["b, c", "a"], "; ") == "valid: b, c; a"
     many = [f"name_{i}" for i in range(21)]
     assert specs.choices_text("name_0x", many).startswith("did you mean name_0? near: name_0, ")
     assert specs.choices_text("name_0x", many).endswith("; 21 are valid")

@@ -66,7 +66,7 @@ def check_file(
 
     def problem(path: Path) -> str:
         if path.suffix.lower() not in suffixes:
-            return f"must end in {suffixes[0]}"
+            return f"must end in {' or '.join(suffixes)}"
         for file in (path, path.with_suffix(beside)) if beside else (path,):
             there, name = False, "" if file == path else f"{file} "
             with contextlib.suppress(FileNotFoundError, NotADirectoryError):

@@ -98,6 +98,12 @@ def grid(arms: Sequence[Arm], texts: Sequence[str], flags: Flags) -> list[Arm]:
             raise ConfigError(f"--grid={text}: must be FLAG=VALUE,VALUE, as in --grid=lr_rl=1e-4,3e-4")
         if flag not in known:
             raise ConfigError(f"--grid={text}: --{flag}: {unknown(flag, known)}")
+        for first, second in itertools.pairwise(values):
+            if ":" in first and "=" in second.partition(":")[0]:
+                raise ConfigError(
+                    f"--grid={text}: {second!r} is an option; a ; separates values that have commas, as in "
+                    f"--grid='{flag}={first},{second};{first}'"
+                )
         if flag in axes or flag in flags:
             raise ConfigError(f"--grid={text}: --{flag} is given beside it; give it once")
         if twice := next((value for value in values if values.count(value) > 1), None):

@@ -240,12 +240,12 @@ def parse(text: str, flag: str = "game") -> specs.Spec:
     elif name not in REGISTRY and first and "=" not in first:
         text = f"gymnasium:id={name}:{first}{comma}{options}"
     elif name not in REGISTRY:
-        raise specs.SpecError(f"--{flag}={' '.join(text.split())}: {_instead(name)}valid: {_kinds()}")
+        raise specs.SpecError(f"--{flag}={' '.join(text.split())}: {_instead(name)}valid: {_kinds(flag)}")
     return specs.parse(text, REGISTRY, flag)
 
 
-def _kinds() -> str:
-    """What games there are, for errors."""
+def _kinds(flag: str) -> str:
+    """What games there are, for errors; of --games, which is a list, its suites, too."""
     others = [name for name in REGISTRY if name not in ("atari", "catch", "gymnasium")]
     kinds = (
         "an Atari-57 game (Pong, MsPacman, ...)",
@@ -253,7 +253,8 @@ def _kinds() -> str:
         "CatchDistractor",
         "catch:ball=2,background=moving",
     )
-    return ", ".join((*kinds, "gymnasium:id=Name-v0", "module:Name-v0", *others))
+    suites = [f"or a suite of Atari games ({', '.join(SUITES)})"] if flag == "games" else []
+    return ", ".join((*kinds, "gymnasium:id=Name-v0", "module:Name-v0", *others, *suites))
 
 
 def _instead(name: str) -> str:

@@ -243,7 +243,9 @@ def read_manifest(path: str | Path) -> Manifest:
         if not os.path.lexists(path / MANIFEST) and (found := _all(folder)):
             path = found[-1]
     if path == given and not any(os.path.lexists(path / name) for name in (MANIFEST, CHECKSUM)):
-        raise ConfigError(f"{path}: no checkpoint there; name a run directory or one of its checkpoints")
+        seeds = sorted(path.glob("seed*/checkpoints")) if os.path.isdir(path) else []
+        run = f"one of the runs in it, as {seeds[0].parent}," if seeds else "a run directory"
+        raise ConfigError(f"{path}: no checkpoint there; name {run} or one of its checkpoints")
     data = _read(path / MANIFEST)
     if _read(path / CHECKSUM) != _sum_line(data):
         raise ConfigError(f"{path / MANIFEST}: damaged: its sha256 is not the one in {CHECKSUM}")

@@ -114,6 +114,8 @@ def test_a_list_that_was_cut_at_commas():
     assert envs.several(["Pong", "3"]) == ["Pong", "BattleZone", "NameThisGame", "Phoenix"]
     with pytest.raises(SpecError, match="^--games=Pang: did you mean Pong"):
         envs.several(["Pang"])
+    with pytest.raises(SpecError, match=r"^--games=7: valid: .* suite .*\(26, 5, 3, signed, thesis\)"):
+        envs.several(["7"])
 
 
 def test_suites_are_of_atari_games_and_as_large_as_their_names_say():

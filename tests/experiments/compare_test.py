@@ -146,6 +146,7 @@ def test_packed_runs_and_folders_of_arms_are_read_alike(runs, tmp_path, capsys):
         (("a", "a/", "linked"), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
         (("a", "nothing"), "nothing: no run directory there"),
         (("a", "b", "--key=eval/return_men"), "no run has it; there are eval/return_mean"),
+        (("a", "c", "--key=nope"), "no run has it; there are eval/return_mean, loss/x, updates, wall_s$"),
         (("a", "c", "--key=text"), "c: text is not a number in each row"),
         (("a", "pong"), "of different games, Catch, Pong; --force compares"),
         (("a", "noisy"), "another protocol than .*eps_eval is 0.005 there and 0.5 here; --force"),

@@ -253,6 +253,7 @@ def _run(*arguments):
         (["--figure=6.3", "--preset=demo"], "--preset: the figure's arms decide it; a JSON file names arms"),
         (["--figure=6.3", "--encoder_from=x"], "--encoder_from: the figure's arms decide it"),
         (["--figure=atari100k", "--preset=demo"], "--preset: a sweep gives it to each run; --presets"),
+        (["--figure=6.3", "--published=Nope"], "--published=Nope: valid: Random; Human; DER, as reported; "),
         (["--figure=6.3", "--published=Hunan"], "--published=Hunan: did you mean Human"),
         (["--figure=6.3", "--gpus_per_run=1"], "--gpus_per_run: only --launcher=ray takes it"),
         (["--figure=6.3", "--games=Catch", "--redraw"], "no evaluation of any arm of figure 6.3"),

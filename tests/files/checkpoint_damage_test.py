@@ -88,6 +88,9 @@ def test_missing_checkpoints_are_named(tmp_path):
     for path in (tmp_path, tmp_path / "nowhere"):
         with pytest.raises(ConfigError, match=f"{path}: no checkpoint there"):
             checkpoint.read_manifest(path)
+    write(tmp_path / "seeds/seed3", env_steps=1000)
+    with pytest.raises(ConfigError, match=f"name one of the runs in it, as {tmp_path}/seeds/seed3, or"):
+        checkpoint.read_manifest(tmp_path / "seeds")
     # A directory that should be one is damaged; it is not passed over.
     write(tmp_path, env_steps=1000)
     (tmp_path / "checkpoints" / "000002000").mkdir()

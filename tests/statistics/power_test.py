@@ -153,6 +153,7 @@ def test_published_spreads_are_those_of_the_tables():
         (["--spread=0"], "a positive number, not '0'"),
         (["--spread=1,2,3"], "one or two numbers"),
         (["--from=published"], "needs a game"),
+        (["--from=no/where"], "^--from=no/where: no run directory there"),
         (["--from=published", "--game=Catch"], "--game=Catch: .* needs a game with published spreads"),
         (["--from=published", "--game=Pong", "--arm=x"], "--arm=x: give it twice"),
         (["--from=published", "--game=Pong", "--arm=x", "--arm=y"], "--arm=x: Pong: "),

@@ -359,7 +359,7 @@ def test_the_command_line(monkeypatch, tmp_path, capsys):
     [
         ([], "--runs: missing"),
         (["."], "--out: missing"),
-        ([".", "--out=a.txt"], "must end in .html"),
+        ([".", "--out=a.txt"], "must end in .html or .htm"),
         ([".", "--out=a/b\n.html"], "has the character"),
         ([".", "--out=file/a.html"], "not a directory"),
         (["none", "--out=a.html"], "--runs=none: no such directory"),

@@ -198,6 +198,7 @@ def test_a_grid_is_an_arm_for_each_combination():
         (["lr_rl=1e-3,1e-3"], "1e-3 is given 2 times; give it once"),
         (["lr=1,2"], "--lr: no such flag; did you mean --lr_encoder"),
         (["n_step=1,2"], "--n_step: is now --rl=:n_step"),
+        (["encoder=tiny:features=8,pool=none"], "'pool=none' is an option; a ; separates values that have"),
         (["gamma=0.9", "gamma=0.99"], "--gamma is given beside it"),
         (["steps=1,2"], "--steps is given beside it"),
     ],
