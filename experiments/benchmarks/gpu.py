@@ -27,7 +27,7 @@ def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_enum("device", "gpu", ["gpu", "cpu"], "cpu: only to try this program", values)
     config_flags.define("updates", Info(int, "updates timed for each figure", minimum=1), 500, values)
-    config_flags.define("seeds", Info(int, "seeds in one process", minimum=1, maximum=1_000), 8, values)
+    config_flags.define("seeds", Info(int, "seeds in one process", minimum=1, maximum=1_000), 16, values)
     seconds = Info(float, "length of the run that 5M env steps follow from", "s", above=0)
     config_flags.define("seconds", seconds, 180.0, values)
     flags.DEFINE_string("out", None, "directory for gpu.json; must be new or empty", values)
