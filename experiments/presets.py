@@ -436,14 +436,3 @@ def source_preset(name: str, table: Mapping[str, str]) -> str:
     first, *rest = name.split("+")
     rest = [part for part in rest if not part.startswith((OBJECTIVE, "gate/"))]
     return "+".join((table[first], *rest)) if first in table else ""
-
-
-def summary(name: str) -> str:
-    """What a preset trains, in a line."""
-    values = preset_values(name)
-    losses = [split(text)[0] for text in values.get("objectives", ())]
-    name, options = split(values["encoder"])
-    encoder = name + (f" of {options['features']} features" if "features" in options else "")
-    shift = ["random shift"] if values.get("augment") == "all" else []
-    what = [values["mode"], encoder, " + ".join(losses), *shift, f"{values['steps']:,} env steps"]
-    return f"{values['game']}: {', '.join(filter(None, what))}"

@@ -12,7 +12,7 @@ from srl_jax import specs
 from srl_jax.files import display
 
 from .. import PACKAGE
-from ..presets import OBJECTIVE, PIECES, PIECES_HELP, PRESETS, summary
+from ..presets import OBJECTIVE, PIECES, PIECES_HELP, PRESETS, preset_values
 from ..protocols import PROTOCOLS
 
 GROUPS: dict[str, str] = {
@@ -140,6 +140,27 @@ def _presets(objectives: Iterable[str]) -> Iterator[str]:
     for name in objectives:
         line = f"with --objective=+{name}, at its default options; --mode=rl_only becomes joint"
         yield f"  {'PRESET+' + OBJECTIVE + name:34}  {line}"
+
+
+def summary(name: str) -> str:
+    """What a preset trains, in a line."""
+    values = preset_values(name)
+    rl, of_rl = specs.split(values.get("rl", "rainbow"))
+    encoder, of_encoder = specs.split(values["encoder"])
+    features = of_encoder.get("features", "0")
+    what = [
+        values["mode"],
+        "" if values["mode"] == "pretrain" else rl,
+        f"n of {of_rl['n_step']}" if "n_step" in of_rl else "",
+        encoder + (f" of {features} features" if features != "0" else ""),
+        " + ".join(specs.split(text)[0] for text in values.get("objectives", ())),
+        "random shift" if values.get("augment") == "all" else "",
+        f"resets of {reset}" if (reset := values.get("reset")) else "",
+        f"epsilon to {values['eps_final']:g}" if "eps_final" in values and rl == "drq" else "",
+        f"{values['steps']:,} env steps",
+        f"{values['updates_per_step']:g} updates each" if values.get("updates_per_step", 0) > 1 else "",
+    ]
+    return f"{values['game']}: {', '.join(filter(None, what))}"
 
 
 def _protocols() -> Iterator[str]:

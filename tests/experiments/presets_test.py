@@ -5,6 +5,7 @@ import dataclasses
 import pytest
 
 from experiments import train
+from experiments.command_line import help
 from experiments.presets import (
     ENCODER_PRESETS,
     PIECES,
@@ -12,7 +13,6 @@ from experiments.presets import (
     PRESETS,
     preset_values,
     source_preset,
-    summary,
 )
 from srl_jax import checks, encoders, objectives, rl, specs
 from srl_jax.config import Config
@@ -228,5 +228,5 @@ def test_a_changed_preset_starts_from_one_that_is_changed_likewise():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_summary_is_a_line(name):
-    text = summary(name)
+    text = help.summary(name)
     assert text.startswith(f"{PRESETS[name]['game']}: {PRESETS[name]['mode']}, ") and len(text) < 120
