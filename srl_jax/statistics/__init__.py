@@ -8,9 +8,8 @@ same: where numbers of runs differ, a run of a game with few of them weighs more
 
 Which interval is right for what is decided in `estimates.py`, behind `estimate` and `estimate_difference`: t
 intervals for means on one game (Student's of an arm, Welch's of a difference) and over games, and for
-interquartile means of few runs of 20 games or more; for all else percentile intervals of the stratified
-bootstrap, which draws runs again within each game. At the points of learning curves [runs, points] it is
-`mean_interval(returns.T)`.
+interquartile means of few runs; for all else percentile intervals of the stratified bootstrap, which draws
+runs again within each game. At the points of learning curves [runs, points] it is `mean_interval(returns.T)`.
 An `Interval` says which it is. A single run has none: its limits are NaN.
 
 With few runs the bootstrap is too narrow. docs/figures.md has which share of intervals at 95 % contains the
