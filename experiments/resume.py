@@ -42,7 +42,9 @@ def command_line(run: str) -> list[str]:
         raise ConfigError(
             f"{run}: runs of a sweep, each by itself; name one of them, or give srl-jax sweep --out={root}"
         )
-    numbers = ",".join(name.removeprefix("seed") for name in seeds) + ","[: len(seeds) == 1]
+    numbers = ",".join(name.removeprefix("seed") for name in seeds)
+    if len(seeds) == 1:
+        numbers += ","  # a lone number is refused
     return [f"--config={path / seeds[0] / 'config.json'}", f"--seeds={numbers}", *goes_on]
 
 

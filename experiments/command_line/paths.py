@@ -80,8 +80,10 @@ def check_file(
                 return f"{name}exists and is not a file"
         if path.absolute().parent.is_dir():
             return _closed(path.absolute().parent)
-        why = _no_place(path.parent) if deep else ""
-        return f"{path.parent}: {why}" if why else "" if deep else "no such directory"
+        if not deep:
+            return "no such directory"
+        why = _no_place(path.parent)
+        return f"{path.parent}: {why}" if why else ""
 
     return _checked(flag, text, problem)
 
