@@ -13,6 +13,7 @@ from typing import Any, TypeAlias
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+from flax.errors import ScopeParamShapeError
 from jax import Array
 from jax.custom_derivatives import SymbolicZero
 
@@ -153,7 +154,25 @@ def sim_norm(z: Array, group: int) -> Array:
     return nn.softmax(z.reshape(*z.shape[:-1], -1, group)).reshape(z.shape)
 
 
-class Dense(nn.Module):
+class Layer(nn.Module):
+    """A layer whose weights are [shape], float32."""
+
+    def weights(self, name: str, init: Callable[..., Array], shape: tuple[int, ...]) -> Array:
+        """As `self.param`, which would trace the initialiser wherever the layer is applied, a quarter of what
+        tracing an update takes.
+
+        Raises:
+            flax.errors.ScopeParamShapeError: the weights that are given have another shape.
+        """
+        if not self.has_variable("params", name):
+            return self.param(name, init, shape)
+        value = self.get_variable("params", name)
+        if jnp.shape(value) != shape:
+            raise ScopeParamShapeError(name, "/".join(self.path), jnp.shape(value), shape)
+        return value
+
+
+class Dense(Layer):
     """A linear layer, float32 [B, inputs] -> [B, features]; PyTorch's default initialisation."""
 
     features: int
@@ -161,12 +180,12 @@ class Dense(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         init = uniform_fan_in(x.shape[-1])
-        kernel = self.param("kernel", init, (x.shape[-1], self.features))
-        bias = self.param("bias", init, (self.features,))
+        kernel = self.weights("kernel", init, (x.shape[-1], self.features))
+        bias = self.weights("bias", init, (self.features,))
         return x @ kernel + bias
 
 
-class WideDense(nn.Module):
+class WideDense(Layer):
     """`Dense` for far more outputs than inputs; its kernel is [features, inputs], as PyTorch keeps it.
 
     The product that gives the inputs' gradient then runs along the rows of a kernel that may have 10M
@@ -180,12 +199,12 @@ class WideDense(nn.Module):
     def __call__(self, x: Array) -> Array:
         inputs = x.shape[-1]
         init = uniform_fan_in(inputs)
-        kernel = self.param("kernel", init, (self.features, inputs))
-        bias = self.param("bias", init, (self.features,))
+        kernel = self.weights("kernel", init, (self.features, inputs))
+        bias = self.weights("bias", init, (self.features,))
         return x @ kernel.T + jnp.ones((x.shape[0], 1), x.dtype) @ bias[None, :]
 
 
-class Conv(nn.Module):
+class Conv(Layer):
     """A convolution, float32 or uint8 [B, H, W, C] -> float32 [B, H', W', features].
 
     Attributes:
@@ -214,8 +233,8 @@ class Conv(nn.Module):
         if self.zero_sum:
             init = zero_sum(init)
         init = scaled(init, self.init_scale)
-        kernel = self.param("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
-        bias = self.param("bias", bias_init, (self.features,))
+        kernel = self.weights("kernel", init, (self.kernel, self.kernel, x.shape[-1], self.features))
+        bias = self.weights("bias", bias_init, (self.features,))
         pads = padding_of(self.padding, x.shape[1:3], self.kernel, self.stride)
         if any(map(any, pads)):
             x = jnp.pad(x, [(0, 0), *pads, (0, 0)])
@@ -239,7 +258,7 @@ def padding_of(padding: Padding, sides: Sequence[int], kernel: int, stride: int)
     return pads
 
 
-class ConvTranspose(nn.Module):
+class ConvTranspose(Layer):
     """A transposed convolution as a VALID one: float32 [B, h, w, C] -> [B, *size, features].
 
     With stride s, output pixel `y * s + r` is `sum_j x[y - j] @ kernel[j * s + r]`: an ordinary convolution
@@ -275,8 +294,8 @@ class ConvTranspose(nn.Module):
                 raise ValueError(f"a kernel of {k} with stride {s} cannot make {wanted} pixels from {given}")
         fan_in = max(1, k // s) ** 2 * channels  # the inputs that reach an output pixel
         init, bias_init = INITIALISERS[self.initial](fan_in)
-        kernel = self.param("kernel", scaled(init, self.init_scale), (k, k, channels, self.features))
-        bias = self.param("bias", bias_init, (self.features,))
+        kernel = self.weights("kernel", scaled(init, self.init_scale), (k, k, channels, self.features))
+        bias = self.weights("bias", bias_init, (self.features,))
         taps = -(-k // s)
         kernel = jnp.pad(kernel, [(0, taps * s - k)] * 2 + [(0, 0)] * 2)
         kernel = kernel.reshape(taps, s, taps, s, channels, self.features)[::-1, :, ::-1]
@@ -300,7 +319,7 @@ def factorised_noise(key: Array, size: int) -> Array:
     return jax.lax.cond(noise[0] > -100.0, lambda e: e, lambda e: -e, noise)
 
 
-class NoisyDense(nn.Module):
+class NoisyDense(Layer):
     """A linear layer with factorised Gaussian noise on its weights (Fortunato et al. 2018, section 3).
 
     `y = x (mu + sigma * f(e_in) f(e_out)^T) + mu_b + sigma_b * f(e_out)`. One draw serves the whole batch.
@@ -320,10 +339,10 @@ class NoisyDense(nn.Module):
         inputs = x.shape[-1]
         init = uniform_fan_in(inputs)
         sigma = nn.initializers.constant(self.std / math.sqrt(inputs), jnp.float32)
-        kernel = self.param("kernel", init, (inputs, self.features))
-        bias = self.param("bias", init, (self.features,))
-        kernel_sigma = self.param("kernel_sigma", sigma, (inputs, self.features))
-        bias_sigma = self.param("bias_sigma", sigma, (self.features,))
+        kernel = self.weights("kernel", init, (inputs, self.features))
+        bias = self.weights("bias", init, (self.features,))
+        kernel_sigma = self.weights("kernel_sigma", sigma, (inputs, self.features))
+        bias_sigma = self.weights("bias_sigma", sigma, (self.features,))
         if noise is None:
             return x @ kernel + bias
         noise_in, noise_out = noise[:inputs], noise[inputs:]

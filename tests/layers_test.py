@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from flax.errors import ScopeParamShapeError
 
 from srl_jax import layers
 from srl_jax.layers import Conv, ConvTranspose, Dense, NoisyDense, WideDense
@@ -357,3 +358,17 @@ def test_noisy_dense_noise_is_one_outer_product_in_the_size_of_its_sigmas():
     np.testing.assert_allclose((y[0] - params["bias"]) / sigma, f[inputs:], atol=1e-4)
     noise = (y[1:] - y[0] - params["kernel"]) / sigma
     np.testing.assert_allclose(noise, np.outer(f[:inputs], f[inputs:]), atol=1e-4)
+
+
+def test_a_layer_is_applied_without_its_initialiser_and_refuses_weights_of_another_shape(monkeypatch):
+    init, apply = layers.functions(Dense(2), (1, 3))
+    params = init(jax.random.key(0))
+
+    def initialiser(fan_in):
+        return lambda *_: pytest.fail("the initialiser is traced though there are weights")
+
+    monkeypatch.setattr(layers, "uniform_fan_in", initialiser)
+    expected = np.ones((1, 3)) @ params["kernel"] + params["bias"]
+    np.testing.assert_allclose(apply(params, jnp.ones((1, 3))), expected, rtol=1e-6)
+    with pytest.raises(ScopeParamShapeError, match="kernel"):
+        apply(params, jnp.ones((1, 4)))
