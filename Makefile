@@ -71,7 +71,7 @@ soak: install ## try to break what is promised about killed runs, disks, inputs 
 	@$(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c constraints.txt -e '.[soak]'
 	@$(VENV)/bin/python -m pytest $(if $(findstring tests/soak,$(ARGS)),,tests/soak) $(ARGS)
 
-bench: install ## time this project beside PyTorch and Tianshou, and print a table (ten minutes)
+bench: install ## time this project beside PyTorch and Tianshou, and print a table (11 minutes)
 	@$(VENV)/bin/python -m experiments.benchmarks.bench $(ARGS)
 
 bench-gpu: install ## time updates, seeds and a whole run on an accelerator (needs the extra cuda12 or cuda13)

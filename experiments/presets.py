@@ -10,6 +10,7 @@ import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from srl_jax import checks
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.learning.modes import GATES, MODES, PROJECTING, both_train
@@ -422,6 +423,21 @@ def preset_values(name: str, game: str | None = None) -> dict[str, Any]:
     if whole and values["mode"] != "pretrain" and game in _SOLVED:
         values["stop_at_return"] = _SOLVED[game]
     return values
+
+
+def preset_config(name: str, **fields: Any) -> Config:
+    """The configuration of a preset, for `srl_jax.train`: as `srl-jax train --preset=NAME` has it.
+
+    Args:
+        name: see `preset_values`.
+        fields: of Config, in place of the preset's.
+
+    Raises:
+        ConfigError: there is no such preset, or it cannot be run like that, or nothing reads a field that was
+            given.
+    """
+    values = preset_values(name, fields.get("game"))
+    return checks.check(Config(**{**values, **fields}), given=fields)
 
 
 def source_preset(name: str, table: Mapping[str, str]) -> str:

@@ -166,7 +166,7 @@ class Layer(nn.Module):
         """
         if not self.has_variable("params", name):
             return self.param(name, init, shape)
-        value = self.get_variable("params", name)
+        value: Array = self.get_variable("params", name)
         if jnp.shape(value) != shape:
             raise ScopeParamShapeError(name, "/".join(self.path), jnp.shape(value), shape)
         return value

@@ -9,8 +9,8 @@ A file registers what it has when it is imported:
 
 `--import=my_file.py --objective=mine` imports it, and so does a module's name, `--import=my_package.losses`.
 An installed package names its rows as entry points of the groups `srl_jax.objectives`, `srl_jax.encoders`,
-`srl_jax.rl`, `srl_jax.augment` (views) and `srl_jax.files.loggers`; those are looked up where a name is in no
-registry.
+`srl_jax.rl`, `srl_jax.envs`, `srl_jax.augment` (views) and `srl_jax.loggers`; those are looked up where a
+name is in no registry.
 """
 
 import functools
@@ -27,7 +27,7 @@ from types import ModuleType
 from typing import Any
 
 from srl_jax.errors import ConfigError
-from srl_jax.specs import option_defaults
+from srl_jax.specs import Spec, SpecError, option_defaults
 
 
 class Registry(dict[str, Callable]):
@@ -99,6 +99,37 @@ class Registry(dict[str, Callable]):
             except Exception as error:
                 raise ConfigError(f"{name!r} of {group}, the entry point {value}: {reason(error)}") from error
         return bool(found)
+
+
+def build(spec: Spec, registry: Mapping[str, Callable], *context: Any, gives: type = object) -> Any:
+    """Calls the row's factory: `factory(*context, **spec.resolved)`.
+
+    Args:
+        spec: of a row.
+        registry: that it is in.
+        context: what the registry's factories take.
+        gives: what they give.
+
+    Raises:
+        SpecError: the factory raised ValueError (two options that do not fit together, say), or it is not of
+            this package and raised anything, or gives something else.
+    """
+    factory = registry[spec.name]
+    try:
+        found = factory(*context, **spec.resolved)
+    except SpecError:
+        raise
+    except Exception as error:
+        if isinstance(error, ValueError):
+            why = " ".join(str(error).split())
+        elif foreign(factory):
+            why = reason(error, Path(origin(factory)))
+        else:
+            raise
+        raise SpecError(f"{spec.where}: {why}") from error
+    if not isinstance(found, gives):
+        raise SpecError(f"{spec.where}: its factory must give {gives.__name__}, not {type(found).__name__}")
+    return found
 
 
 def located(text: str, flag: str = "import") -> str:

@@ -429,21 +429,6 @@ def parse(text: str, registry: Mapping[str, Callable], flag: str = "") -> Spec:
     return Spec(name, options, {**defaults, **options}, flag, needs_of(registry[name]), defaults)
 
 
-def build(spec: Spec, registry: Mapping[str, Callable], *context: Any) -> Any:
-    """Calls the row's factory: `factory(*context, **spec.resolved)`.
-
-    Raises:
-        SpecError: the factory raised ValueError (two options that do not fit together, say).
-    """
-    try:
-        return registry[spec.name](*context, **spec.resolved)
-    except SpecError:
-        raise
-    except ValueError as error:
-        reason = " ".join(str(error).split())
-        raise SpecError(f"{spec.where}: {reason}") from error
-
-
 def _where(flag: str, text: str) -> str:
     text = " ".join(text.split())
     return f"--{flag}={text}" if flag else repr(text)

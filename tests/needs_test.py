@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments import packing
-from srl_jax import checks, encoders, envs, objectives, rl, specs
+from srl_jax import checks, encoders, envs, objectives, plugins, rl, specs
 from srl_jax.checks import NEEDS
 from srl_jax.config import INFOS, Config, unresolved
 from srl_jax.encoders.options import ENDS, POOLS
@@ -68,8 +68,8 @@ def observed(kind: str, text: str) -> dict:
     registry = REGISTRIES[kind]
     spec = specs.parse(text, registry, kind)
     if kind == "encoder":
-        return of_encoder(specs.build(spec, registry, (84, 84, 4)))
-    found = specs.build(spec, registry, CONTEXT)
+        return of_encoder(plugins.build(spec, registry, (84, 84, 4)))
+    found = plugins.build(spec, registry, CONTEXT)
     return (of_algorithm if kind == "rl" else of_objective)(found, ENCODER)
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from srl_jax import specs
+from srl_jax import plugins, specs
+from srl_jax.types import Encoder
 
 
 def _sum(context, *, weight: float = 1.0, n_step: int = 3, low: float = -10.0, noisy=True, kind="a"):
@@ -106,13 +107,26 @@ def test_an_error_is_one_line_that_names_the_flag_and_what_is_valid(text, parts)
 
 def test_build_calls_the_factory_with_the_context_and_every_option():
     spec = specs.parse("sum:weight=2,noisy=false", REGISTRY)
-    assert specs.build(spec, REGISTRY, "context") == ("context", 2.0, 3, -10.0, False, "a")
+    assert plugins.build(spec, REGISTRY, "context") == ("context", 2.0, 3, -10.0, False, "a")
 
 
 def test_what_a_factory_refuses_is_a_spec_error():
     spec = specs.parse("sum:kind=bad", REGISTRY, "encoder")
     with pytest.raises(specs.SpecError, match="^--encoder=sum:kind=bad: kind is bad$"):
-        specs.build(spec, REGISTRY, None)
+        plugins.build(spec, REGISTRY, None)
+
+
+def test_what_is_wrong_with_a_factory_of_somebody_else_is_said_in_one_line():
+    def of_objectives(context):
+        return context.features
+
+    registry = {"mine": of_objectives, "number": lambda shape: 3}
+    with pytest.raises(
+        specs.SpecError, match=r"^--encoder=mine: line \d+: AttributeError: 'tuple' object has"
+    ):
+        plugins.build(specs.parse("mine", registry, "encoder"), registry, (84, 84, 4))
+    with pytest.raises(specs.SpecError, match="^--encoder=number: its factory must give Encoder, not int$"):
+        plugins.build(specs.parse("number", registry, "encoder"), registry, (84, 84, 4), gives=Encoder)
 
 
 def test_an_option_without_a_usable_default_is_a_mistake_in_the_factory():

@@ -11,7 +11,7 @@ import numpy as np
 from flax.serialization import to_state_dict
 from flax.traverse_util import flatten_dict, unflatten_dict
 
-from srl_jax import encoders, specs
+from srl_jax import encoders, plugins, specs
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import checkpoint
 from srl_jax.types import Encoder, Params
@@ -87,7 +87,7 @@ def from_npz(path: str | os.PathLike[str]) -> tuple[Encoder, Params]:
         raise ConfigError(f"{path}: not an encoder that srl-jax export has written") from None
     try:
         row = specs.parse(spec, encoders.REGISTRY)
-        encoder = specs.build(row, encoders.REGISTRY, shape)
+        encoder = plugins.build(row, encoders.REGISTRY, shape, gives=Encoder)
         template = jax.eval_shape(encoder.init, jax.random.key(0))
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{path}: {error}") from None

@@ -11,7 +11,7 @@ import re
 from collections.abc import Callable, Iterable
 from typing import Any
 
-from srl_jax import specs
+from srl_jax import plugins, specs
 from srl_jax.errors import ConfigError
 from srl_jax.plugins import Registry
 
@@ -273,7 +273,7 @@ def game(text: str, flag: str = "game") -> Game:
         SpecError: there is no such game, or its options do not fit together; one line.
     """
     spec = parse(text, flag)
-    row = specs.build(spec, REGISTRY)
+    row = plugins.build(spec, REGISTRY, gives=Game)
     return dataclasses.replace(row, kind=row.kind or spec.name)
 
 

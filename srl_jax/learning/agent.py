@@ -168,13 +168,15 @@ def components(
     """
     height, width, channels = frame_shape
     shape = (height, width, config.frame_stack * channels)
-    encoder = specs.build(specs.parse(config.encoder, encoders.REGISTRY, "encoder"), encoders.REGISTRY, shape)
+    spec = specs.parse(config.encoder, encoders.REGISTRY, "encoder")
+    encoder = plugins.build(spec, encoders.REGISTRY, shape, gives=Encoder)
     context = Context.of(encoder, num_actions)
-    algorithm = specs.build(specs.parse(config.rl, rl.REGISTRY, "rl"), rl.REGISTRY, context)
+    spec = specs.parse(config.rl, rl.REGISTRY, "rl")
+    algorithm = plugins.build(spec, rl.REGISTRY, context, gives=Algorithm)
     if modes.of(config).rl:
         context = context._replace(rl_layer=algorithm.first_layer)
     parsed = [specs.parse(text, objectives.REGISTRY, "objective") for text in config.objectives]
-    terms = {spec.name: specs.build(spec, objectives.REGISTRY, context) for spec in parsed}
+    terms = {spec.name: plugins.build(spec, objectives.REGISTRY, context, gives=Objective) for spec in parsed}
     for spec in parsed:
         given = spec.options.get(specs.WEIGHT)
         if isinstance(given, specs.Weight) and terms[spec.name].weight is not given:

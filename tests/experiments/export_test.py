@@ -13,7 +13,7 @@ from absl import flags
 import srl_jax
 from experiments import export
 from experiments.command_line import flags as config_flags
-from srl_jax import encoders, specs
+from srl_jax import encoders, plugins, specs
 from srl_jax.errors import ConfigError, SaveError
 from tests.helpers import JOINT, fill, identical, write_checkpoint
 
@@ -122,7 +122,7 @@ def computed(steps, arrays, x):
 def test_what_the_file_says_is_enough_to_run_the_encoder(tmp_path, spec, side):
     # At 37 and 45 pixels some strides do not fit, and zeros are added.
     row = specs.parse(spec, encoders.REGISTRY)
-    encoder = specs.build(row, encoders.REGISTRY, (side, side, 2))
+    encoder = plugins.build(row, encoders.REGISTRY, (side, side, 2))
     params = fill(jax.eval_shape(encoder.init, jax.random.key(0)))
     encoders.to_npz(tmp_path / "enc.npz", encoder, params, spec)
     with np.load(tmp_path / "enc.npz", allow_pickle=False) as file:

@@ -11,6 +11,7 @@ from experiments.presets import (
     PIECES,
     POLICY_PRESETS,
     PRESETS,
+    preset_config,
     preset_values,
     source_preset,
 )
@@ -18,6 +19,7 @@ from srl_jax import checks, encoders, objectives, rl, specs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.learning import modes
+from srl_jax.needs import EVERYTHING
 
 # The arms of every figure of the thesis, and the runs that make their encoders.
 ARMS = [
@@ -60,9 +62,20 @@ def test_every_mode_has_a_catch_preset():
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_preset_is_a_valid_run(name):
-    config = checks.check(_config(name), given=())
+    config = preset_config(name, **({"encoder_from": "x"} if name in ENCODER_PRESETS else {}))
     full = train.resolved(config)
     assert train.resolved(full) == full
+    # `srl_jax.train` takes it, which cannot know what was given and what the preset brings.
+    assert train.resolved(checks.check(config), EVERYTHING) == full
+
+
+def test_a_field_beside_a_preset_is_read_or_refused():
+    config = preset_config("thesis/joint_256", game="Breakout", gamma=0.5)
+    assert (config.game, config.gamma, config.stop_at_return) == ("Breakout", 0.5, None)
+    with pytest.raises(ConfigError, match="^--gate=pcgrad: nothing reads it in --mode=rl_only"):
+        preset_config("catch/rl_only", gate="pcgrad")
+    with pytest.raises(ConfigError, match="^--encoder_from: --mode=frozen needs"):
+        preset_config("catch/frozen")
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import objectives, rl, specs
+from srl_jax import objectives, plugins, rl, specs
 from srl_jax.latents import make_latents, shut
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, make_optimizer
@@ -70,7 +70,7 @@ def test_a_decoder_that_is_not_there_is_told_in_one_line(name):
     bare = Context.of(make_encoder()._replace(make_decoder=None), helpers.NUM_ACTIONS)
     for context in (Context(features=8, num_actions=3), bare):
         with pytest.raises(specs.SpecError, match=message):
-            specs.build(spec, objectives.REGISTRY, context)
+            plugins.build(spec, objectives.REGISTRY, context)
 
 
 def test_a_context_is_what_the_encoder_says():

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax import encoders, objectives, rl, specs
+from srl_jax import encoders, objectives, plugins, rl, specs
 from srl_jax.augment import UNCHANGED
 from srl_jax.config import Config
 from srl_jax.diagnostics.functions import make_functions
@@ -204,7 +204,7 @@ def test_a_tied_decoder_by_hand():
 @pytest.mark.parametrize(("name", "size"), [("nature:padding=same", 21), ("der", 23), ("tiny", 19)])
 def test_a_tied_decoders_convolutions_are_the_transposes_of_the_encoders(name, size):
     spec = specs.parse(name, encoders.REGISTRY)
-    encoder = specs.build(spec, encoders.REGISTRY, (size, size, 2))
+    encoder = plugins.build(spec, encoders.REGISTRY, (size, size, 2))
     decoder = encoder.make_tied_decoder()
     params = helpers.random_params(encoder.init)
     ((group, part),) = decoder.reads.items()

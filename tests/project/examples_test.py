@@ -11,7 +11,7 @@ import pytest
 from absl import flags
 from gymnasium.utils.env_checker import check_env
 
-from examples import foreign_loop, own_objective, use_an_encoder
+from examples import foreign_loop, own_encoder, own_objective, use_an_encoder
 from examples.own_environment import Dot
 from experiments import train
 from experiments.command_line import flags as config_flags
@@ -39,8 +39,19 @@ def trained(*arguments):
     """Trains a small run as the command line does."""
     values = flags.FlagValues()
     train.define_flags(values)
-    config_flags.parse(["train", *arguments, *(f"--{name}={value}" for name, value in SMALL.items())], values)
+    given = {argument.partition("=")[0] for argument in arguments}
+    small = [f"--{name}={value}" for name, value in SMALL.items() if f"--{name}" not in given]
+    config_flags.parse(["train", *arguments, *small], values)
     assert train.train(values) == 0
+
+
+def command(example, out):
+    """The arguments of the command in an example's docstring, less its preset and `out`."""
+    text = example.__doc__.split("\n\n")[1].replace("\\\n", " ")
+    program, name, *arguments = shlex.split(text)
+    assert (program, name, arguments.pop()) == ("srl-jax", "train", f"--out={out}")
+    arguments.remove("--preset=catch/joint")
+    return arguments
 
 
 @pytest.mark.filterwarnings("ignore:.*:UserWarning")  # what gymnasium's checker recommends
@@ -70,11 +81,11 @@ def test_an_environment_of_ones_own_is_trained(tmp_path, few_held_out):
     assert list((tmp_path / "run/figures").glob("*.png"))
 
 
-def test_an_own_objective_is_trained_as_it_says_and_its_encoder_is_used_elsewhere(tmp_path, few_held_out):
-    command, path = own_objective.__doc__.split("\n\n")[1].replace("\\\n", " "), tmp_path / "run"
-    program, name, *arguments = shlex.split(command)
-    assert (program, name, arguments.pop()) == ("srl-jax", "train", "--out=runs/slow")
-    trained(*arguments, f"--out={path}")
+def test_an_own_objective_and_encoder_are_trained_as_they_say_and_used_elsewhere(tmp_path, few_held_out):
+    path = tmp_path / "run"
+    own = [*command(own_objective, "runs/slow"), *command(own_encoder, "runs/two_layers")]
+    trained(*own, "--preset=catch/joint", f"--out={path}")
+    assert Config.load(path).encoder == "two_layers:features=32"
     assert "continuity:weight=0.01" in Config.load(path).objectives
     rows = read_metrics(path / "metrics.jsonl")
     last = {kind: [row for row in rows if row["kind"] == kind][-1] for kind in ("train", "eval")}
@@ -108,3 +119,15 @@ def test_the_foreign_loop_plays_and_learns_with_one_import():
     assert errors[-1] < errors[0] - 0.2
     text = pathlib.Path(foreign_loop.__file__).read_text(encoding="utf-8")
     assert len(re.findall("^ *(?:from|import) srl_jax", text, re.MULTILINE)) == 1
+
+
+@pytest.mark.parametrize("side", [42, 84])
+def test_an_own_encoder_fits_what_it_encodes(side):
+    shape = (side, side, 4)
+    encoder = own_encoder.two_layers(shape, features=8)
+    frames = np.arange(2 * np.prod(shape)).reshape(2, *shape).astype(np.uint8)
+    params, decoder = encoder.init(jax.random.key(0)), encoder.make_decoder()
+    of_bytes, of_floats = (encoder.apply(params, x) for x in (frames, frames / np.float32(255)))
+    np.testing.assert_allclose(of_bytes, of_floats, atol=1e-5)
+    assert of_bytes.shape == (2, 8)
+    assert decoder.apply(decoder.init(jax.random.key(1)), of_bytes).shape == frames.shape

@@ -90,8 +90,8 @@ def test_the_library_is_one_import_and_costs_nothing_until_it_is_used():
         light = "jax" not in sys.modules and "numpy" not in sys.modules
         known = callable(srl_jax.data.published) and callable(srl_jax.statistics.welch_power)
         config = srl_jax.Config(game="Catch")
-        from experiments.presets import preset_values
-        config = srl_jax.Config(**preset_values("demo+objective/spr+gate/pcgrad"))
+        from experiments.presets import preset_config
+        config = preset_config("demo+objective/spr+gate/pcgrad")
         light = light and "jax" not in sys.modules
         from srl_jax import *
         from srl_jax.replay import Replay as replay

@@ -10,7 +10,7 @@ import optax
 import pytest
 import rlax
 
-from srl_jax import rl, specs
+from srl_jax import plugins, rl, specs
 from srl_jax.rl import heads, values
 from srl_jax.types import Context, Latents, Window
 from tests.helpers import all_zero, count, identical, random_params
@@ -285,7 +285,7 @@ def test_a_row_has_the_options_that_something_reads():
 def test_without_a_distribution_its_options_may_have_their_defaults():
     # config.json of a run without a distribution has the defaults of its options, which say nothing.
     spec = specs.parse("rainbow:distributional=false", rl.REGISTRY)
-    specs.build(specs.parse(spec.full, rl.REGISTRY), rl.REGISTRY, CONTEXT)
+    plugins.build(specs.parse(spec.full, rl.REGISTRY), rl.REGISTRY, CONTEXT)
 
 
 OTHER = {"atoms": ATOMS, "v_min": -2.0, "v_max": 4.0, "init_std": 1.5, "priority": "kl"}
