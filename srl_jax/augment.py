@@ -66,7 +66,12 @@ def crop_pad_crop(frames: Array, key: Array, cut: int = 4, pad: int = 4) -> Arra
 
     Returns:
         The same shape and dtype.
+
+    Raises:
+        ValueError: the first crop would have no two pixels a side, and every image one colour.
     """
+    if (least := min(frames.shape[1:3])) < cut + 2:
+        raise ValueError(f"crop_pad_crop cuts {cut} pixels off each side, and the frames have {least}")
     first, second = jax.random.split(key)
     corner = jax.random.randint(first, (2,), 0, cut + 1)
     moved = jax.random.randint(second, (2,), 0, 2 * pad - cut + 1)

@@ -122,7 +122,7 @@ class Config:
     buffer_size: int = _steps(100_000, "capacity of the replay buffer", unit="transitions")
     batch_size: int = _steps(32, "batch of one update", unit="transitions")
     updates_per_step: float = _value(
-        float, 0.1, "gradient updates for each env step", "updates per env step", above=0, maximum=1_000
+        float, 0.1, "gradient updates for each env step", "updates per env step", minimum=1e-6, maximum=1_000
     )
     learn_start: int = _steps(320, "env steps before the first update", minimum=0)
     gamma: float = _share(0.99, "discount", "per env step")

@@ -90,7 +90,7 @@ def _collect(stack: int, horizon: int, number: int, **options: Any) -> HeldOut:
     episodes, next_episode = np.arange(ENVS), ENVS
     length = np.zeros(ENVS, int)
     due = np.zeros(ENVS, int)  # the index in `wanted` of the next one of each environment
-    rows: list[tuple[int, np.ndarray, int]] = []
+    rows: list[tuple[int, np.ndarray | None, int]] = []
     frames, info = env.reset()
     replay.begin(frames)
     for step, action in enumerate(actions):
@@ -98,8 +98,7 @@ def _collect(stack: int, horizon: int, number: int, **options: Any) -> HeldOut:
         take = [i for i in everyone if due[i] < wanted.shape[1] and step >= wanted[i, due[i]]]
         for i in take:
             index = (replay.next_position[i] - 1) * ENVS + i
-            state = info["state"][i] if env.state_names else np.zeros(0)
-            rows.append((int(index), state, int(episodes[i])))
+            rows.append((int(index), info["state"][i] if env.state_names else None, int(episodes[i])))
             due[i] += 1
         frames, rewards, terminated, truncated, info = env.step(action)
         length += 1
@@ -116,7 +115,9 @@ def _collect(stack: int, horizon: int, number: int, **options: Any) -> HeldOut:
     indices, states, of_episode = zip(*[rows[i] for i in order], strict=True)
     held_out = HeldOut(
         replay.gather(np.array(indices)),
-        np.array(states, np.float64),
+        np.array(states, np.float64)
+        if env.state_names
+        else np.zeros((number, 0)),  # it may be lost on the way
         env.state_names,
         np.array(of_episode),
         env.state_problem,

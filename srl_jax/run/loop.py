@@ -386,10 +386,14 @@ class Run:
             seed.report.train_row(self.env_steps, self.updates, values)
 
     def start_evaluation(self) -> None:
-        """Measures the latents of now, and has the policies of now evaluated while training goes on."""
+        """Measures the latents of now, and has the policies of now evaluated while training goes on.
+
+        A reset that is due is made by the next step: what is measured has the n and gamma of the last one.
+        """
         self.fetch()
+        now = self.now._replace(gamma_and_n=self.schedules.ended(self.env_steps, self.updates))
         for seed, state in self.each(self.state):
-            seed.start_evaluation(state, self.env_steps, self.updates, self.now)
+            seed.start_evaluation(state, self.env_steps, self.updates, now)
 
     def finish_evaluation(self) -> bool:
         """Waits for the evaluation that is under way, if one is, and writes its rows.

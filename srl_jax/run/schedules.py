@@ -95,9 +95,12 @@ class Schedules:
 
     def row(self, env_steps: int, updates: int) -> dict[str, Any]:
         """What a "train" row says of resets, n and gamma, of the step that ended then."""
-        began = env_steps - self._config.num_envs
-        found = self._annealed(began, updates)
+        found, began = self.ended(env_steps, updates), env_steps - self._config.num_envs
         return found if self._config.reset == "none" else found | {"resets": self.resets(began)}
+
+    def ended(self, env_steps: int, updates: int) -> dict[str, Any]:
+        """`Now.gamma_and_n` of the step that ended then, before a reset that the next one begins with."""
+        return self._annealed(env_steps - self._config.num_envs, updates)
 
     def weights(self, env_steps: int) -> dict[str, float]:
         """The factors of the losses whose weight changes; an update says what a ratio's is."""

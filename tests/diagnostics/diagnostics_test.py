@@ -187,15 +187,26 @@ def test_a_generator_of_ones_own_leaves_replays_alone():
     assert not np.array_equal(first, replay.sample(8, 0.4)[1])
 
 
-def test_a_state_that_is_lost_is_not_probed(monkeypatch):
+@pytest.mark.parametrize("after", [0, 20])
+def test_a_state_that_is_lost_is_not_probed(monkeypatch, after):
     def lost(game, **options):
-        env = made(game, **options)
-        env.state_names, env.state_problem = (), "out of step"
+        env, steps = made(game, **options), 0
+        step = env.step
+
+        def counted(actions):
+            nonlocal steps
+            if steps == after:
+                env.state_names, env.state_problem = (), "out of step"
+            steps += 1
+            return step(actions)
+
+        env.step = counted
         return env
 
     made = envs.make
     monkeypatch.setattr(envs, "make", lost)
     monkeypatch.setattr(heldout, "WINDOWS", 40)
+    heldout._collect.cache_clear()
     held_out = heldout.collect(Config(**SMALL), 1)
     assert (held_out.variables, held_out.problem) == ((), "out of step")
     assert held_out.states.shape == (40, 0)

@@ -1,6 +1,8 @@
 """srl_jax/learning/resets.py and annealing.py: what a reset leaves, and when; n and gamma after it."""
 
+import dataclasses
 from functools import partial
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,7 @@ from srl_jax.learning.update import Hyper, make_init, passes, periodic
 from srl_jax.objectives import REGISTRY
 from srl_jax.rl import REGISTRY as ALGORITHMS
 from srl_jax.rl import rainbow
+from srl_jax.run import loop
 from srl_jax.run.schedules import Schedules, printed
 from srl_jax.types import TrainState
 from tests.helpers import fill, identical, make_context, make_encoder
@@ -205,6 +208,20 @@ def test_resets_come_with_the_first_step_that_begins_then_or_later():
     # A row is of the step that ended, which had not been reset yet.
     assert schedules.row(24, 4) == {"n_step": 1, "resets": 0}
     assert schedules.row(32, 8)["resets"] == 1
+
+
+def test_what_is_measured_when_a_reset_is_due_has_the_n_of_what_was_learnt():
+    config = Config(num_envs=8, learn_start=16, updates_per_step=0.5, reset="head", reset_every=20)
+    schedules, measured = Schedules(dataclasses.replace(config, n_anneal="3->1@2"), Hyper({}, {})), []
+    seed = SimpleNamespace(start_evaluation=lambda *given: measured.append(given[-1].gamma_and_n))
+    run = SimpleNamespace(schedules=schedules, state=None)
+    run.fetch, run.each = lambda: None, lambda state: [(seed, state)]
+    for run.env_steps, run.updates in ((0, 0), (24, 4), (32, 8)):
+        run.now = schedules.at(run.env_steps, run.updates)
+        loop.Run.start_evaluation(run)
+    # The step that begins at 24 starts with a reset, which makes n 3 again.
+    assert measured == [{"n_step": 3}, {"n_step": 1}, {"n_step": 1}]
+    assert schedules.at(24, 4).gamma_and_n == {"n_step": 3}
 
 
 def test_without_flags_rows_and_windows_have_nothing_new():

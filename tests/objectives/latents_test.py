@@ -156,6 +156,11 @@ def test_a_crop_that_is_padded_and_cropped_holds_pixels_of_the_image_in_order():
     assert len(starts) > 4
 
 
+def test_a_crop_of_a_single_pixel_is_refused():
+    with pytest.raises(ValueError, match="^crop_pad_crop cuts 4 pixels off each side, .* have 5\\b"):
+        make_view("crop_pad_crop")(window_of(np.zeros((1, 5, 5, 1), np.uint8)), jax.random.key(0))
+
+
 def window_of(frames: np.ndarray) -> Window:
     window = make_window(batch=1, horizon=1)
     return window._replace(frames=frames[None])
