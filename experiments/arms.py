@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 from srl_jax import envs
 from srl_jax.config import INFOS
-from srl_jax.data import thesis_curve
+from srl_jax.data import thesis_curve, thesis_curves
 from srl_jax.errors import ConfigError
 from srl_jax.files.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text, near
@@ -205,7 +205,9 @@ def read_figure(path: Path) -> Figure:
         flags = {
             flag: _flag_text(refuse, number, flag, value) for flag, value in arm.get("flags", {}).items()
         }
-        arms.append(FigureArm(arm["name"], arm["preset"], flags, arm.get("thesis", "")))
+        if (curve := arm.get("thesis", "")) and curve not in (known := thesis_curves()):
+            raise refuse(f"arm {number}: the thesis has no curve {curve}; {choices_text(curve, known)}")
+        arms.append(FigureArm(arm["name"], arm["preset"], flags, curve))
     names = [arm.name for arm in arms]
     for name in (values["name"], *names):
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):

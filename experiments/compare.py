@@ -15,7 +15,7 @@ import numpy as np
 from absl import flags
 
 from srl_jax import specs, statistics
-from srl_jax.config import INFOS, Config
+from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display
 from srl_jax.files.metrics import LEADING
@@ -126,8 +126,8 @@ def _labels(arms: Sequence[Arm]) -> list[str]:
 def differing(arms: Sequence[Arm]) -> dict[str, list[str]]:
     """The settings in which two arms that have them differ: {flag: its value in each arm, or `ABSENT`}.
 
-    An option of a specification is a setting, too: rainbow:n_step. Games, and what seeds of an arm may differ
-    in, do not count.
+    An option of a specification is a setting, too: rainbow:n_step. Of a run that they start from its arm is.
+    Games, seeds, and what is written beside rows do not count.
     """
     each = [_settings(arm.config) for arm in arms]
     names = dict.fromkeys(name for settings in each for name in settings)
@@ -137,14 +137,18 @@ def differing(arms: Sequence[Arm]) -> dict[str, list[str]]:
 
 def _settings(config: Config) -> dict[str, str]:
     return {
-        f"{row}:{option}" if row else INFOS[field].flag or field: value if row else _text(value)
+        f"{row}:{option}" if row else INFOS[field].flag or field: value if row else _text(field, value)
         for field, row, option, value in collect.settings(config)
-        if field not in collect.OF_A_SEED
+        if field not in (*collect.WRITTEN, "seed")
     }
 
 
-def _text(value: Any) -> str:
-    """A setting; a small number as 1e-4."""
+def _text(field: str, value: Any) -> str:
+    """A setting; a small number as 1e-4, and of a run that it starts from, the arm."""
+    if field in SOURCES:
+        return collect.source_arm(value) if value else "none"
+    if field == "imports":
+        return " + ".join(Path(text).name for text in value) or "none"
     if isinstance(value, float) and 0 < abs(value) < 0.01:
         digits, _, power = f"{value:e}".partition("e")
         return f"{float(digits):g}e{int(power)}"

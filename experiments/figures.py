@@ -296,8 +296,10 @@ def run(values: flags.FlagValues) -> int:
         methods = _names(text, atari100k_methods()) if values["published"].present else None
     else:
         methods = _names(text, (entry.method for game in envs.ATARI_57 for entry in published(game)))
-    if values["dry_run"].value and values["redraw"].value:
-        raise ConfigError("--dry_run: --redraw starts no run; leave one of them out")
+    if values["redraw"].value:
+        own = (flag for flag in ("dry_run", *options.LAUNCHER, *given) if values[flag].present)
+        if flag := next((flag for flag in own if flag != "import"), None):
+            raise ConfigError(f"--{flag}: --redraw starts no run; leave one of them out")
     if values["dry_run"].value:
         workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
         entries = manifest.resolve(runs)
@@ -313,6 +315,9 @@ def run(values: flags.FlagValues) -> int:
             if code >= 128:  # told to end
                 return code
         read = collect.load_named(root, [run.name for run in runs])
+        # A game of a plug-in may have options beside those that were given, and that its directory has.
+        whole = {run.path.relative_to(root).parts[0]: run.game for run in read}
+        games = [whole.get(envs.file_name(game), game) for game in games]
         for line in absent(figures, games, seeds, read):
             display.say(line)
         asked = {"methods": methods, "force": values["force"].value, "among": collect.arm_names(root)}

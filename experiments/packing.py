@@ -164,6 +164,7 @@ def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, 
         ConfigError: there is no run, or see `added`, `read` and `run_data.load_run`; nothing was written.
         OSError: a file could not be written.
     """
+    root = Path(os.path.abspath(root))  # "." has a name, too
     found = [load_run(path) for path in run_directories(root)]
     if not found:
         raise ConfigError(f"--runs={root}: no run directory there (none has a config.json)")
@@ -180,6 +181,9 @@ def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, 
 
 def unpack(folder: Path, root: Path) -> int:
     """Makes the directories of packed runs: config.json, metrics.jsonl and ended.json.
+
+    A run that had all its env steps before there was an ended.json gets one, by which sweeps and figures know
+    that it is done.
 
     Args:
         folder: the packed one.
@@ -199,8 +203,8 @@ def unpack(folder: Path, root: Path) -> int:
         path.mkdir(parents=True, exist_ok=True)
         config_file.write(path, run.about)
         replace_text(path / "metrics.jsonl", "".join(json.dumps(row) + "\n" for row in run.rows))
-        if run.ended is not None:
-            ending.write(path, run.ended)
+        if ended := run.ended or (Ending("finished", run.rows[-1]["env_steps"]) if run.over else None):
+            ending.write(path, ended)
     return len(runs)
 
 

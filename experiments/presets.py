@@ -310,13 +310,21 @@ def _with_gate(name: str, values: dict[str, Any]) -> dict[str, Any]:
     return {**values, "gate": name}
 
 
+def _augmented(values: dict[str, Any]) -> dict[str, Any]:
+    """Settings with random shift of all frames, where nothing else says what is seen."""
+    row, options = split(values["rl"])
+    if "rl_view" in values or "srl_view" in values or "view" in options or row == "drq":
+        raise ConfigError("the preset has views of its own, which --augment would not change")
+    return {**values, **_AUG}
+
+
 PIECES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "small": _small,
     "textbook": functools.partial(
         _with_options, {field: dict.fromkeys(options) for field, options in _FIVE_CHOICES.items()}
     ),
     "five_choices": functools.partial(_with_options, _FIVE_CHOICES),
-    "aug": functools.partial(_over, _AUG),
+    "aug": _augmented,
     **{f"protocol/{name}": functools.partial(_over, own) for name, own in PROTOCOLS.items()},
     **{f"gate/{name}": functools.partial(_with_gate, name) for name in GATES},
 }

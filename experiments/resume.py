@@ -6,6 +6,7 @@ ended if it was trained with --keep_replay; --stop_at_return; --keep_replay; --k
 """
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -35,7 +36,8 @@ def command_line(run: str) -> list[str]:
         return [f"--config={path / 'config.json'}", *goes_on]
     if (path / FILE).is_file():
         raise ConfigError(f"{run}: a sweep, which srl-jax sweep --out={run} resumes")
-    seeds = sorted((folder.parent.name for folder in path.glob("seed*/config.json")), key=natural)
+    there = (file.parent.name for file in path.glob("seed*/config.json"))
+    seeds = sorted((name for name in there if re.fullmatch(r"seed\d+", name)), key=natural)
     if not seeds:
         raise ConfigError(f"{run}: not a run directory (no config.json)")
     if root := next((root for root in path.absolute().parents[:2] if (root / FILE).is_file()), None):

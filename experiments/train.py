@@ -129,12 +129,15 @@ def _why_not(path: Path, config: Config, overwrite: bool, resume: bool, seeds: b
         return (
             f"{min(others)} lies beside the runs of seeds, so --overwrite does not delete them; move it away"
         )
+    own = {path, *path.glob("seed*")}
+    if other := next((x.parent for x in sorted(path.rglob("config*.json")) if x.parent not in own), None):
+        return f"{other.relative_to(path)} lies in it, which --overwrite would delete with it; move it away"
     for flag in SOURCES:
         source = getattr(config, flag)
         if source and Path(source).resolve().is_relative_to(path.resolve()):
             return f"--overwrite would delete --{flag}={source}"
-    own = Path.cwd().is_relative_to(path.resolve())
-    return "--overwrite would delete the working directory" if own else ""
+    here = Path.cwd().is_relative_to(path.resolve())
+    return "--overwrite would delete the working directory" if here else ""
 
 
 def check_seeds(values: flags.FlagValues) -> list[int]:

@@ -100,8 +100,7 @@ def _fields(config: Config) -> dict[str, str]:
         elif field in ("imports", "loggers"):
             found[field] = ", ".join(Path(text).name for text in value) or "none"
         elif value and field in ("encoder_from", "policy_from"):
-            # The arm that the path of a run, or of a checkpoint in it, is of.
-            found[field] = collect.arm_name(Path(re.sub(r"/(checkpoints|encoders)(/.*)?$", "", value)))
+            found[field] = collect.source_arm(value)
         else:
             found[field] = value_text(value)
     return found

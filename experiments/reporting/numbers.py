@@ -46,19 +46,32 @@ class Game(NamedTuple):
     Attributes:
         name: of the game.
         runs: arm -> its runs, arms in the order of the page.
+        taken: those of which numbers are shown.
         comparable: whether there are runs to compare.
         comparison: of them; None also where they have no env step in common.
     """
 
     name: str
     runs: dict[str, list[RunData]]
+    taken: list[RunData]
     comparable: bool
     comparison: Comparison | None
 
     @property
     def sound(self) -> list[RunData]:
-        """Those that have not failed: others would cut all curves."""
-        return [run for runs in self.runs.values() for run in runs if not run.failed]
+        """Those taken that have not failed: others would cut all curves."""
+        return [run for run in self.taken if not run.failed]
+
+    @property
+    def cut(self) -> list[str]:
+        """A line for each arm whose curves of training end before its longest run does."""
+        lines = []
+        for arm, runs in collect.grouped(self.sound).get(self.name, {}).items():
+            reached = {run.seed: reached_step(run) for run in runs}
+            if (least := min(reached.values())) < max(reached.values()):
+                seeds = ", ".join(str(seed) for seed, steps in reached.items() if steps == least)
+                lines.append(f"{arm}: cut at {least:,} env steps, where seed {seeds} is")
+        return lines
 
     @property
     def first(self) -> list[RunData]:

@@ -83,7 +83,7 @@ def build(
         taken = [x for those in ordered.values() for x in those if not finished_only or numbers.finished(x)]
         comparable = collect.comparable(taken)
         comparison = numbers.compare(comparable) if comparable else None
-        games.append(numbers.Game(name, ordered, bool(comparable), comparison))
+        games.append(numbers.Game(name, ordered, taken, bool(comparable), comparison))
     comparisons = {game.name: game.comparison for game in games if game.comparison}
     differing, shared = configs.settings(runs, arms)
     looks = styles(arms)

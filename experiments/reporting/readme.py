@@ -2,6 +2,7 @@
 
 from pathlib import Path
 from typing import NamedTuple
+from urllib.parse import unquote
 
 from markdown_it import MarkdownIt
 from markdown_it.token import Token
@@ -69,7 +70,7 @@ def read(folder: Path) -> Readme | None:
 def _safe(token: Token, folder: Path, shown: list[Path]) -> Token:
     """The token as it may stand in a page that is read elsewhere; its picture becomes part of the page."""
     if token.type == "image":
-        path = (folder / str(token.attrs["src"])).resolve()
+        path = (folder / unquote(str(token.attrs["src"]))).resolve()
         inside = path.is_relative_to(folder.resolve()) and path.suffix in (".png", ".gif")
         picture = pictures.taken(path, pictures.LARGEST) if inside else None
         if picture is None:

@@ -5,13 +5,14 @@ run has the link's name. Runs may be packed, see `packing`. Imports no jax.
 """
 
 import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from srl_jax import checks, specs, statistics
+from srl_jax import checks, envs, specs, statistics
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.data import Published, ReferencePolicy
 from srl_jax.errors import ConfigError
@@ -30,13 +31,37 @@ PROTOCOL = (
 )  # fmt: skip
 """Fields that say what a score means: runs that differ in one are not compared, unless forced."""
 
-OF_A_SEED = (
-    "seed", "encoder_from", "policy_from", "imports", "loggers",
-    "checkpoint_every", "keep_encoder_every", "keep_best", "keep_replay",
-)  # fmt: skip
-"""Fields in which runs of one arm and game may differ: what is theirs alone, and what is written of them
-beside their rows.
-"""
+WRITTEN = ("loggers", "checkpoint_every", "keep_encoder_every", "keep_best", "keep_replay")
+"""Fields that say what is written of a run beside its rows."""
+OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", *WRITTEN)
+"""Fields in which runs of one arm and game may differ: what is theirs alone, and what is `WRITTEN`."""
+
+
+OF_AN_ARM = tuple(name for name in INFOS if name not in OF_A_SEED)
+"""The other fields, in which they do not differ."""
+
+
+def difference_in_meaning(
+    there: Config, here: Config, names: Iterable[str], differing: Callable[..., str] = difference
+) -> str:
+    """What differs of these fields but for options that one of two configurations, of another version, lacks.
+
+    Where the texts are the same, that takes no jax. Rows of plug-ins are compared as they are written, unless
+    they are imported.
+    """
+    if not (found := differing(there, here, names)):
+        return ""
+    from srl_jax.training import completed
+
+    try:
+        return differing(completed(there), completed(here), names)
+    except ConfigError:
+        return found
+
+
+def source_arm(path: str) -> str:
+    """The arm that the path of a run, or of a checkpoint in it, is of."""
+    return arm_name(Path(re.sub(r"/(checkpoints|encoders|best)(/.*)?$", "", path)))
 
 
 def settings(config: Config) -> Iterator[tuple[str, str, str, Any]]:
@@ -91,16 +116,22 @@ def load_named(root: Path, names: Iterable[str]) -> list[RunData]:
 
     Args:
         root: the directory.
-        names: of the places, GAME/ARM/seedN. Where there is no run, there is none in the result.
+        names: of the places, GAME/ARM/seedN. Where there is no run, there is none in the result. A packed run
+            may have had another path, if it is of that game, arm and seed.
 
     Raises:
         ConfigError: one cannot be read, or is there in both forms.
     """
-    places = [root / name for name in names]
-    found = [load_run(path) for path in places if (path / "config.json").exists()]
-    if packing.is_packed(root):
-        found += [run for run in packing.read(root) if run.path in places]
-    return sorted(_each_once(found), key=lambda run: places.index(run.path))
+    places = list(names)
+    found = [(name, load_run(root / name)) for name in places if (root / name / "config.json").exists()]
+    for run in packing.read(root) if packing.is_packed(root) else ():
+        own = run.path.relative_to(root).as_posix()
+        for name in dict.fromkeys((own, f"{envs.file_name(run.game)}/{run.arm}/seed{run.seed}")):
+            if name in places:
+                found.append((name, run))
+                break
+    found.sort(key=lambda pair: places.index(pair[0]))
+    return list(_each_once([run for _, run in found]))
 
 
 def _each_once(runs: Sequence[RunData]) -> Sequence[RunData]:
@@ -275,14 +306,13 @@ def check_arms(runs: Sequence[RunData]) -> None:
     Raises:
         ConfigError: two differ in more; says in what.
     """
-    names = [name for name in INFOS if name not in OF_A_SEED]
     for game, arms in grouped(runs).items():
         for arm, members in arms.items():
             for line in _other_files(members):
                 display.say(f"{arm} on {game}: {line}")
             for run in members[1:]:
                 one, other = (checks.run_of(x.config).in_force() for x in (members[0], run))
-                if differing := difference(one, other, names):
+                if differing := difference_in_meaning(one, other, OF_AN_ARM):
                     raise ConfigError(
                         f"{run.path}: of the same arm, {arm} on {game}, as {members[0].path}, but {differing}"
                     )

@@ -105,7 +105,7 @@ def run_sweep(
     states.look_at_all(root, entries)
     root = root.absolute()
     rundir.check_free(root)
-    planned = manifest.read(root) | entries
+    planned = manifest.merged(root, entries)
     executor: cf.Executor
     memory = None
     if launcher == "ray":

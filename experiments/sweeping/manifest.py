@@ -15,6 +15,7 @@ from srl_jax.files.reading import parse_json, read_bytes, replace_text
 from srl_jax.needs import Unread
 
 from ..command_line import flags as config_flags
+from ..runs import collect
 from .plan import Planned, settings
 
 FILE = "sweep.json"
@@ -71,6 +72,27 @@ def write(root: Path, entries: Mapping[str, Entry]) -> None:
     runs = [{**run._asdict(), "config": dataclasses.asdict(config)} for run, config in entries.values()]
     with saving(root / FILE):
         replace_text(root / FILE, json.dumps({"format": FORMAT, "runs": runs}, indent=1) + "\n")
+
+
+def merged(root: Path, entries: Mapping[str, Entry]) -> dict[str, Entry]:
+    """The runs of the sweep in a directory, with more of them.
+
+    Raises:
+        ConfigError: the runs there cannot be read; or one that comes would be of an arm on a game that has
+            other settings there.
+    """
+    there = read(root)
+    for name, (_, config) in entries.items():
+        arm = name.rpartition("/")[0]
+        for other, entry in there.items():
+            if other.rpartition("/")[0] == arm and other not in entries:
+                if differing := collect.difference_in_meaning(entry.config, config, collect.OF_AN_ARM):
+                    raise ConfigError(
+                        f"{root}: {name} would be of the same arm as {other} there, but {differing}; name "
+                        "another --out, or move what is there away"
+                    )
+                break
+    return there | entries
 
 
 def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:

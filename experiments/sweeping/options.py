@@ -43,13 +43,16 @@ def define_flags(values: flags.FlagValues) -> None:
     yes("dry_run", False, "print what would run and how long it would take, and exit")
 
 
+LAUNCHER = ("launcher", *_COUNTS, "ray_address")
+
+
 def launcher_options(values: flags.FlagValues) -> dict[str, Any]:
     """What `launching.run_sweep` takes.
 
     Raises:
         ConfigError: a value is not valid, or not for this launcher.
     """
-    found = {name: values[name].value for name in ("launcher", *_COUNTS, "ray_address")}
+    found = {name: values[name].value for name in LAUNCHER}
     for name in ("gpus_per_run", "ray_address"):
         if values[name].present and found["launcher"] == "local":
             raise ConfigError(f"--{name}: only --launcher=ray takes it")

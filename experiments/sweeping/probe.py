@@ -93,7 +93,8 @@ def whole(config: Config, rows: Iterable[Mapping[str, Any]]) -> float:
     first = next(row for row in trains if row["env_steps"] >= config.learn_start + WARM)
     last = trains[-1]
     each = (last["wall_s"] - first["wall_s"]) / (last["env_steps"] - first["env_steps"])
-    games = [row for row in rows if row["kind"] == "eval"][-1]
+    nobody = {"wall_eval_s": 0.0, "wall_s": last["wall_s"]}  # plays where RL is not trained
+    games = next((row for row in reversed(rows) if "wall_eval_s" in row), nobody)
     evaluations = config.steps // config.eval_every
     rest = rows[-1]["wall_s"] - games["wall_s"]
     begun = first["wall_s"] + each * (config.steps - first["env_steps"])

@@ -9,16 +9,17 @@ left to do, the run's directory says.
 import os
 import re
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
-from srl_jax.config import INFOS, Config, difference
+from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files import checkpoint, resuming, rundir
 from srl_jax.files.checkpoint import NUMBERS
 from srl_jax.run import ending
 
+from ..runs.collect import difference_in_meaning
 from .manifest import Entry
 
 
@@ -56,7 +57,7 @@ def look(path: Path, config: Config) -> State:
         raise ConfigError(f"{path}: {error.strerror}") from None
     if not blank:
         names = [name for name in INFOS if name not in ("imports", "loggers")]  # may be others by now
-        if differing := _alike(difference, Config.load(path), config, names):
+        if differing := difference_in_meaning(Config.load(path), config, names):
             raise ConfigError(
                 f"{path}: the run there has another configuration: {differing}; give the flags that it was "
                 "run with, another --out, or move it away"
@@ -75,19 +76,14 @@ def look(path: Path, config: Config) -> State:
     except ConfigError:
         return State("resumable")  # from an older one, or not begun: the run itself finds out
     over = NUMBERS not in found.files or (ended is not None and ended.status == "finished")  # --keep_replay
-    if not over or _alike(resuming.another_run, found.config, config):
+    if not over or _another_run(found.config, config):
         return State("resumable", found.env_steps)
     lacks = resuming.lacks(path, found)
     return State("resumable" if lacks else "done", found.env_steps, lacks)
 
 
-def _alike(differing: Callable[..., str], there: Config, here: Config, *names: Iterable[str]) -> str:
-    """What differs of what two configurations mean; where the texts are the same, that takes no jax."""
-    if not differing(there, here, *names):
-        return ""
-    from srl_jax.training import completed
-
-    return differing(completed(there), completed(here), *names)
+def _another_run(there: Config, here: Config) -> str:
+    return difference_in_meaning(there, here, (), lambda a, b, _: resuming.another_run(a, b))
 
 
 def holder(error: ConfigError) -> str:

@@ -51,12 +51,16 @@ class Progress(NamedTuple):
 
 
 def progress(run: Path, tail: int = 1 << 16) -> Progress:
-    """How far the run in a directory is, from so many bytes at the end of its rows."""
+    """How far the run in a directory is, from the rows in so many bytes at their end, or the last row."""
     try:
         with open(run / "metrics.jsonl", "rb") as file:
             size = file.seek(0, os.SEEK_END)
-            file.seek(max(size - tail, 0))
-            lines = file.read().split(b"\n")[int(size > tail) : -1]
+            while True:
+                file.seek(max(size - tail, 0))
+                lines = file.read().split(b"\n")[int(size > tail) : -1]
+                if lines or tail >= size:
+                    break
+                tail *= 2  # a row may have the returns of thousands of games
     except OSError:
         return Progress()
     found = Progress()
@@ -315,6 +319,11 @@ def best(runs: Sequence[RunData]) -> list[str]:
     found: list[str] = []
     for game, arms in collect.grouped(collect.comparable(runs)).items():
         if len(arms) < 2:
+            continue
+        try:
+            collect.check_arms([run for members in arms.values() for run in members])
+        except ConfigError as error:  # seeds of different settings have no mean
+            found.append(f"{game}: {error}")
             continue
         curves = {arm: [collect.steps_and_returns(run) for run in its] for arm, its in arms.items()}
         try:

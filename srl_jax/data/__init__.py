@@ -119,6 +119,11 @@ def thesis_curve(figure: str, game: str, arm: str) -> tuple[np.ndarray, np.ndarr
     return np.array(steps, np.int64), np.array(returns, np.float64)
 
 
+def thesis_curves() -> list[str]:
+    """What `thesis_curve` has of some game, as FIGURE/ARM: "6.2/rl_only_nature"."""
+    return list(dict.fromkeys(f"{figure}/{arm}" for figure, _, arm in _curves()))
+
+
 def reference_scores(game: str) -> tuple[float, float]:
     """The raw scores that count as 0 and 1: a random policy's and a human's; a miss and a catch in Catch.
 

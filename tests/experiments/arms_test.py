@@ -83,6 +83,10 @@ def test_a_figure_of_ones_own(tmp_path):
         ),
         ({"arms": [GOOD["arms"][0]] * 2}, "two arms have the same name"),
         (
+            {"arms": [{**GOOD["arms"][0], "thesis": "6.3/joint_265"}]},
+            "arm 1: the thesis has no curve 6.3/joint_265; did you mean 6.3/joint_256",
+        ),
+        (
             {"arms": [{**GOOD["arms"][0], "flags": {"srl_evry": 4}}]},
             "arm 1: no flag 'srl_evry'; did you mean srl_every",
         ),

@@ -120,6 +120,10 @@ def test_labels_are_the_first_settings_that_tell_arms_apart():
         "mode=rl_only",
     ]
     assert compare._labels(_arms(Config(), Config(seed=1))) == ["arm0", "arm1"]
+    # What runs start from is told by its arm, and what is written beside rows is not told.
+    sources = [f"runs/Catch/pretrain_{x}/seed{x}/best/000000100" for x in (1, 2)]
+    starts = [Config(mode="frozen", encoder_from=path, keep_best=i > 0) for i, path in enumerate(sources)]
+    assert compare.differing(_arms(*starts)) == {"encoder_from": ["pretrain_1", "pretrain_2"]}
     same = [arm._replace(name="x") for arm in _arms(Config(), Config())]
     assert compare._labels(same) == ["runs/arm0", "runs/arm1"]
     same[1] = same[1]._replace(game="Pong")  # in panels of their own

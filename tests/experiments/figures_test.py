@@ -256,6 +256,9 @@ def _run(*arguments):
         (["--figure=6.3", "--published=Nope"], "--published=Nope: valid: Random; Human; DER, as reported; "),
         (["--figure=6.3", "--published=Hunan"], "--published=Hunan: did you mean Human"),
         (["--figure=6.3", "--gpus_per_run=1"], "--gpus_per_run: only --launcher=ray takes it"),
+        (["--figure=6.3", "--redraw", "--lr_rl=0.5"], "--lr_rl: --redraw starts no run; leave one of them"),
+        (["--figure=6.3", "--redraw", "--workers=3"], "--workers: --redraw starts no run"),
+        (["--figure=6.3", "--redraw", "--dry_run"], "--dry_run: --redraw starts no run"),
         (["--figure=6.3", "--games=Catch", "--redraw"], "no evaluation of any arm of figure 6.3"),
     ],
 )
@@ -289,6 +292,19 @@ def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
     expected.append(GONE.format("joint_50", 4, 4, "0, 1, 3, 4"))
     assert capsys.readouterr().err == "".join(expected)
     assert (runs / "figures" / "6.3.json").read_bytes() == before
+
+
+def test_a_game_of_a_plug_in_is_drawn_whatever_options_its_name_leaves_out(tmp_path, capsys):
+    pytest.importorskip("matplotlib")
+    for seed in range(2):
+        own = {"seed": seed, "game": "mine:size=3", "imports": (str(tmp_path / "mine.py"),)}
+        write_run(tmp_path / f"mine/rl_only_nature/seed{seed}", (0, 1), **own)
+    (tmp_path / "mine.py").touch()
+    given = ["--figure=6.3", "--games=mine", "--seeds=2", f"--import={tmp_path}/mine.py"]
+    assert _run(*given, "--redraw", f"--out={tmp_path}") == 0
+    games = json.loads((tmp_path / "figures/6.3.json").read_text())["games"]
+    assert games["mine:size=3"]["arms"]["rl_only_nature"]["seeds"] == [0, 1]
+    assert "mine:size=3, joint_256: 2 of 2 seeds left out" in capsys.readouterr().err
 
 
 def test_where_all_runs_failed_the_status_says_so(tmp_path, monkeypatch, capsys):

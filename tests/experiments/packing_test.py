@@ -2,6 +2,7 @@
 
 import gzip
 import json
+from pathlib import Path
 from unittest import mock
 
 import pytest
@@ -10,8 +11,11 @@ from absl import flags
 from experiments import figures, packing, report
 from experiments.command_line import flags as config_flags
 from experiments.runs import collect
+from experiments.sweeping import states
+from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.run.ending import Ending
+from srl_jax.training import completed
 from tests.helpers import NOT_FINITE, write_run
 
 ROW = {
@@ -73,7 +77,12 @@ def test_a_packed_run_is_the_run(root, tmp_path):
     for run in runs:
         again = tmp_path / "again" / run.path.relative_to(root) / "metrics.jsonl"
         assert again.read_bytes() == (run.path / "metrics.jsonl").read_bytes()
-    assert _told(collect.load_runs(tmp_path / "again")) == _told(runs)
+    # Unpacked, those that have all their env steps say so, or a sweep would take them for killed.
+    assert [run.over for run in runs if run.ended is None] == [True, True]
+    ended = [run if run.ended else run._replace(ended=Ending("finished", 200)) for run in runs]
+    assert _told(collect.load_runs(tmp_path / "again")) == _told(ended)
+    path = tmp_path / "again/Catch/joint_256/seed0"
+    assert states.look(path, completed(Config.load(path))).kind == "done"
     with pytest.raises(ConfigError, match="a run is there"):
         packing.unpack(tmp_path / "out", tmp_path / "again")
 
@@ -288,3 +297,15 @@ def test_an_addition_that_was_killed_between_its_files_is_made_again(root, tmp_p
         packing.read(out)
     assert packing.pack(root, out) == (5, 6, [])
     assert len(packing.read(out)) == 6
+
+
+def test_packed_runs_are_found_by_what_they_are_runs_of(root, tmp_path, monkeypatch):
+    monkeypatch.chdir(root / "Catch/joint_256")
+    packing.pack(Path("."), tmp_path / "out")  # as seed0 and seed1
+    packing.pack(root, tmp_path / "out")
+    names = [f"Catch/{arm}/seed{seed}" for seed in (1, 0) for arm in ("joint_256", "rl_only_nature")]
+    found = collect.load_named(tmp_path / "out", names)
+    assert [f"{run.game}/{run.arm}/seed{run.seed}" for run in found] == names
+    monkeypatch.chdir(root / "Catch/rl_only_nature/seed0")
+    packing.pack(Path("."), tmp_path / "alone")
+    assert [run.path.name for run in collect.load_runs(tmp_path / "alone")] == ["seed0"]

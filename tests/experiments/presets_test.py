@@ -158,6 +158,11 @@ def test_what_stands_later_overrides():
         **PRESETS["catch/rl_only"],
     }
     assert preset_values("thesis/joint_256+aug")["augment"] == "all"
+    for name in ("spr", "drq", "mrq", "bbf"):
+        with pytest.raises(
+            ConfigError, match=f"^atari100k/{name}[+]aug: aug: the preset has views of its own"
+        ):
+            preset_values(f"atari100k/{name}+aug")
     textbook = preset_values("thesis/joint_256+textbook")
     assert (textbook["rl"], textbook["encoder"]) == ("rainbow", "sac_ae:features=256")
     assert textbook["stop_at_return"] == 20

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -235,6 +236,7 @@ def test_resume_needs_nothing_but_the_directory(loop, tmp_path, monkeypatch):
 def test_resume_finds_the_seeds_of_a_process(loop, tmp_path):
     for seed in (10, 2):
         train_in_process(*CATCH, f"--seed={seed}", f"--out={tmp_path}/runs/seed{seed}")
+    shutil.copytree(tmp_path / "runs/seed2", tmp_path / "runs/seed2_old")  # somebody's copy, and no seed
     assert resume.command_line(f"{tmp_path}/runs") == [
         f"--config={tmp_path}/runs/seed2/config.json", "--seeds=2,10", f"--out={tmp_path}/runs",
         "--resume=auto",

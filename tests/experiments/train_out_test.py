@@ -29,6 +29,15 @@ def test_overwrite_replaces_a_run_but_not_what_it_starts_from(capsys, loop, tmp_
     assert Config.load(out).seed == 1
 
 
+def test_a_run_within_another_is_not_overwritten_with_it(capsys, loop, tmp_path):
+    out = tmp_path / "run"
+    train_in_process("--game=Catch", f"--out={out}")
+    train_in_process("--game=Catch", f"--out={out}/Catch/a/seed0")
+    line = refused(capsys, f"--out={out}", "--overwrite")
+    assert "Catch/a/seed0 lies in it, which --overwrite would delete with it; move it away" in line
+    assert (out / "Catch/a/seed0/config.json").exists() and (out / "config.json").exists()
+
+
 def test_overwriting_that_the_loop_refuses_leaves_the_old_run(capsys, loop, tmp_path, monkeypatch):
     out = tmp_path / "run"
     train_in_process(*CATCH, f"--out={out}")

@@ -121,7 +121,7 @@ def test_a_last_evaluation_before_the_end_is_said(capsys, loop, tmp_path, flags,
         (["--learn_start=291"], "--learn_start=291: no update"),
         (["--learn_start=290", "--updates_per_step=0.1"], ""),
         (["--learn_start=290", "--updates_per_step=0.09"], "--updates_per_step=0.09: no update"),
-        (["--learn_start=32", "--updates_per_step=1e-9"], "--updates_per_step=1e-09: no update"),
+        (["--learn_start=32", "--updates_per_step=1e-6"], "--updates_per_step=1e-06: no update"),
     ],
 )
 def test_a_run_without_an_update_is_said(capsys, loop, tmp_path, flags, says):

@@ -79,7 +79,7 @@ def test_many_pictures_are_made_smaller_still(tmp_path, monkeypatch):
         run.path / "figures/reconstruction.png", run.path / "figures/losses.png"
     )  # which a report draws
     monkeypatch.setattr(gallery, "LARGEST_PICTURE", 20_000)
-    games = [numbers.Game("Catch", {"rl": [run]}, True, None)]
+    games = [numbers.Game("Catch", {"rl": [run]}, [run], True, None)]
     (shown,) = gallery.own_pictures(games)["Catch"]["png"]
     with opened(shown.picture) as image:
         assert image.format == "WEBP" and image.width == pictures.COLUMN

@@ -1,6 +1,7 @@
 """Tests of experiments.runs.collect."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -105,6 +106,14 @@ def test_runs_of_an_arm_differ_in_nothing_that_changes_a_row_but_their_seed(tmp_
     write_run(tmp_path / "a/seed1", encoder_from="x/seed1", seed=1, **kept)
     write_run(tmp_path / "b/seed0", gamma=0.9)
     collect.check_arms(collect.load_runs(tmp_path))
+    # Of a version before an option there is, and with the option written out.
+    for seed, rl in enumerate(("rainbow:hidden=8", "rainbow:hidden=8,n_step=3")):
+        write_run(tmp_path / f"c/seed{seed}", seed=seed, rl=rl)
+    collect.check_arms(collect.load_runs(tmp_path))
+    write_run(tmp_path / "c/seed2", seed=2, rl="rainbow:hidden=9")
+    with pytest.raises(ConfigError, match="seed2.*c on Catch.*but rl is rainbow"):
+        collect.check_arms(collect.load_runs(tmp_path / "c"))
+    shutil.rmtree(tmp_path / "c")
     write_run(tmp_path / "a/seed2", seed=2, gamma=0.9)
     with pytest.raises(ConfigError, match="seed2.*a on Catch.*gamma is 0.99 there and 0.9 here$"):
         collect.check_arms(collect.load_runs(tmp_path))

@@ -41,6 +41,15 @@ def test_command_lines_that_are_refused(tmp_path, arguments, says):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_the_status_writes_nothing_and_may_be_asked_where_nothing_can_be_written(tmp_path, monkeypatch):
+    monkeypatch.setattr(
+        sweep.paths, "check_place", lambda *_: pytest.fail("--status asks whether it may write")
+    )
+    values, _ = _main(f"--out={tmp_path}", "--status")
+    with pytest.raises(ConfigError, match="no sweep there"):
+        sweep.main(values)
+
+
 @pytest.mark.parametrize("given", ["--presets=catch/joint", "--seeds=2", "--lr_rl=1e-3", "--dry_run"])
 def test_the_status_takes_nothing_that_would_plan_another_sweep(tmp_path, given):
     values, _ = _main(f"--out={tmp_path}", "--status", given)

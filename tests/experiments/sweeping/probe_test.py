@@ -33,6 +33,9 @@ def test_a_whole_run_by_hand():
     assert probe.whole(CONFIG, short()) == pytest.approx(20 + 950 + 20)
     # A final evaluation comes once.
     assert probe.whole(CONFIG, short(final=30.0)) == pytest.approx(20 + 950 + 20 + 30)
+    # Without a policy nobody plays: the rows of evaluations have no time, or there are none.
+    bare = [{k: x for k, x in row.items() if k != "wall_eval_s"} for row in short()]
+    assert probe.whole(CONFIG, bare) == pytest.approx(20 + 950 + 2)
 
 
 def test_it_foretells_a_longer_run_of_the_same_kind():

@@ -50,6 +50,8 @@ def test_progress_is_read_from_the_end(tmp_path):
     # A long file: its beginning is not read, its last whole line counts.
     write(tmp_path / "run", (0, 1.0, -1.0), *((n, n / 4) for n in range(20_000)))
     assert status.progress(tmp_path / "run") == Progress(19_999, 19_999 / 4, None)
+    # A row may be longer than what is read at first.
+    assert status.progress(tmp_path / "run", tail=20) == Progress(19_999, 19_999 / 4, None)
 
 
 def test_a_rate_is_a_runs_own_or_that_of_runs_like_it(tmp_path):

@@ -218,6 +218,21 @@ def test_a_changed_plan_is_merged(stubs):
     assert (stubs.root / "sweep.json").read_bytes() == before
 
 
+def test_seeds_of_other_settings_are_no_seeds_of_an_arm_that_is_there(stubs):
+    assert stubs.run(A) == 0
+    before = (stubs.root / "sweep.json").read_bytes()
+    name, (run, config) = A.replace("seed0", "seed1"), ALL[A]
+    other = {name: Entry(run._replace(name=name), dataclasses.replace(config, seed=1, gamma=0.5))}
+    told = (
+        "would be of the same arm as .*seed0 there, but gamma is 0.99 there and 0.5 here; name another --out"
+    )
+    with pytest.raises(ConfigError, match=told):
+        launching.run_sweep(stubs.root, other)
+    assert (stubs.root / "sweep.json").read_bytes() == before
+    same = {name: other[name]._replace(config=dataclasses.replace(config, seed=1, keep_best=False))}
+    assert list(manifest.merged(stubs.root, same)) == [A, name]
+
+
 def test_a_directory_that_somebody_writes_to_is_waited_for(stubs, capsys):
     other = subprocess.Popen(stubs.acts(b=["wait", "end"]).command(ALL[B].run), cwd=stubs.root)
     stubs.wait_for(B)
