@@ -39,7 +39,12 @@ from .populations import RESULTS
 
 ROOT = RESULTS.parents[1]
 PAGE, README = ROOT / "docs" / "answers.md", ROOT / "README.md"
-ANALYSES = {"claims": "interval_claims", "coverage": "coverage", "predictors": "diagnostics_predict"}
+ANALYSES = {
+    "claims": "interval_claims",
+    "coverage": "coverage",
+    "objectives": "catch_objectives_table",
+    "predictors": "diagnostics_predict",
+}
 """{module: the folder of results that it writes}."""
 MARK = re.compile(r"(<!--(?P<what>[^>]+?)-->)(?P<text>[^<]*)(<!---->)")
 WEIGHTS = (1, -1, -1, 1)
