@@ -114,3 +114,23 @@ def test_arms_are_in_the_order_of_their_numbers(tmp_path):
     for arm in ("weight10", "weight9", "weight100", "joint_50"):
         write_run(tmp_path / arm / "seed0", [0.0])
     assert numbers.arms_of(collect.load_runs(tmp_path)) == ["joint_50", "weight9", "weight10", "weight100"]
+
+
+def test_where_curves_of_training_end_early_is_said(tmp_path):
+    runs = [collect.load_run(write_run(tmp_path / f"a/seed{seed}", [0.0], seed=seed)) for seed in range(3)]
+    runs[1] = runs[1]._replace(rows=runs[1].rows[:-1])  # 100 env steps of 200
+    taken = {"all": runs, "whole": [runs[0], runs[2]]}
+    games = {name: numbers.Game("Catch", {"a": runs}, those, True, None) for name, those in taken.items()}
+    assert games["all"].cut == ["a: cut at 100 env steps, where seed 1 is"]
+    assert games["whole"].cut == [] and games["whole"].sound == taken["whole"]
+
+
+def test_a_picture_of_a_readme_may_have_any_name(tmp_path):
+    Image.new("RGB", (4, 4)).save(tmp_path / "größe 1.png")
+    (tmp_path / "README.md").write_text("# A\n\n![x](größe%201.png)\n", encoding="utf-8")
+    assert pages.readme.read(tmp_path).pictures == [tmp_path / "größe 1.png"]
+
+
+def test_a_run_that_starts_from_a_best_checkpoint_starts_from_its_arm():
+    for below in ("", "/best", "/best/000000100", "/encoders/000000100", "/checkpoints"):
+        assert collect.source_arm(f"runs/Catch/pretrain/seed0{below}") == "pretrain"
