@@ -1,5 +1,6 @@
 """What of a configuration is read, and what fits together. Imports no jax."""
 
+import dataclasses
 from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
@@ -255,6 +256,8 @@ def check(
         )
     run_of(config).refuse(given)
     config = run_of(config).in_force()
+    if not mode.rl and "rl" not in given:  # given, it is looked at where its row and defaults are known
+        config = dataclasses.replace(config, rl=type(config).rl)
     annealing.check(config, mode)
     if config.gate in PROJECTING and config.encoder_optimizer == "separate":
         raise ConfigError(

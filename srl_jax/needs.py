@@ -130,11 +130,7 @@ class Run(NamedTuple):
         """The configuration, with defaults where nothing reads what it has."""
         run, defaults = self, type(self.config)()
         unread: dict[str, Any]
-        while unread := {
-            name: getattr(defaults, name)
-            for name, need in run.needs.items()
-            if getattr(run.config, name) != getattr(defaults, name) and run.lacks(need)
-        }:
+        while unread := {name: getattr(defaults, name) for name, _ in run.unread()}:
             config = dataclasses.replace(run.config, **unread)
             run = run._replace(config=config, rl=None if "rl" in unread else run.rl)
         return run.config
