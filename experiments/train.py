@@ -40,6 +40,7 @@ from srl_jax.training import check_game, check_sources, completed, resolved
 from .command_line import flags as config_flags
 from .command_line import paths, runtime
 from .command_line.stopping import signals
+from .packing import CONFIGS
 
 
 def define_flags(values: flags.FlagValues) -> None:
@@ -130,7 +131,8 @@ def _why_not(path: Path, config: Config, overwrite: bool, resume: bool, seeds: b
             f"{min(others)} lies beside the runs of seeds, so --overwrite does not delete them; move it away"
         )
     own = {path, *path.glob("seed*")}
-    if other := next((x.parent for x in sorted(path.rglob("config*.json")) if x.parent not in own), None):
+    there = (found.parent for name in ("config.json", CONFIGS) for found in sorted(path.rglob(name)))
+    if other := next((folder for folder in there if folder not in own), None):
         return f"{other.relative_to(path)} lies in it, which --overwrite would delete with it; move it away"
     for flag in SOURCES:
         source = getattr(config, flag)
