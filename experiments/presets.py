@@ -66,13 +66,10 @@ _CATCH = {
     "eval_envs": 100,  # a third of a short run's time went into playing them ten at once
 }
 # While it is being learnt: what is left to learn after these steps says little about an encoder.
-_SHORT = {
-    "steps": 30_000,
-    "eval_every": 3_000,
-    "eval_games": 100,
-    "eps_anneal_steps": 10_000,
-    "beta_anneal_steps": 30_000,
-}
+_SHORT = {"steps": 30_000, "eval_every": 3_000, "eval_games": 100}
+_SHORT |= {"eps_anneal_steps": 10_000, "beta_anneal_steps": 30_000}
+
+_DEMO = {"steps": 20_000, "eval_every": 10_000, "eval_games": 5}
 
 # Atari 100k: 100,000 decisions with one environment, as published codes have it; docs/atari100k.md has where
 # each value comes from, and protocols.py how it is evaluated.
@@ -347,15 +344,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     **{f"small/{name}": _small(values) for name, values in _ARMS.items()},
     **{f"atari100k/{name}": values for name, values in _ATARI100K.items()},
     # What `make train` runs: a look at the whole in about three minutes on two cores.
-    "demo": {
-        **_JOINT,
-        "game": "Pong",
-        "rl": "rainbow",
-        "encoder": _NATURE,
-        "steps": 20_000,
-        "eval_every": 10_000,
-        "eval_games": 5,
-    },
+    "demo": {**_JOINT, "game": "Pong", "rl": "rainbow", "encoder": _NATURE, **_DEMO},
     # One for each mode. With one Adam on the sum of the losses: with two, these settings learn more slowly.
     "catch/rl_only": {**_CATCH, "mode": "rl_only"},
     "catch/pretrain": {**_CATCH, **_JOINT, "mode": "pretrain"},
@@ -441,8 +430,7 @@ def preset_config(name: str, **fields: Any) -> Config:
         fields: of Config, in place of the preset's.
 
     Raises:
-        ConfigError: there is no such preset, or it cannot be run like that, or nothing reads a field that was
-            given.
+        ConfigError: there is no such preset, or it cannot be run like that, or nothing reads a field.
     """
     values = preset_values(name, fields.get("game"))
     return checks.check(Config(**{**values, **fields}), given=fields)
