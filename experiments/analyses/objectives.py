@@ -22,9 +22,11 @@ from .. import arms, packing
 from ..command_line import flags as config_flags
 from ..drawing import plots
 from ..runs import collect
+from ..runs.json_values import limits
 from ..runs.run_data import RunData
 from . import output
 from .populations import RESULTS
+from .predictors import LEVEL, holm
 
 CAMPAIGN = RESULTS / "catch_objectives"
 BASELINES = {"joint": "rl_only_256", "decoupled": "frozen_random"}
@@ -74,7 +76,7 @@ def of_game(game: str, members: Mapping[str, Sequence[RunData]], baseline: str) 
         taken = [float(statistics.steps_to(*curve, target)) for curve in curves[arm]]
         row: dict[str, Any] = {
             "seeds": [run.seed for run in runs],
-            "area": _limits(statistics.contrast([area], [1])),
+            "area": limits(statistics.contrast([area], [1])),
             "at the end": float(ends[arm]["at_the_end"].mean()),
             "target": float(target),
             "reached": int(np.isfinite(taken).sum()),
@@ -84,12 +86,12 @@ def of_game(game: str, members: Mapping[str, Sequence[RunData]], baseline: str) 
         }
         if arm != baseline:
             areas = area, ends[baseline]["area_under_curve"]
-            row["difference"] = _limits(statistics.contrast(areas, [1, -1]))
+            row["difference"] = limits(statistics.contrast(areas, [1, -1]))
             row["p"] = float(statistics.welch_p(*areas))
         rows[arm] = row
-    tested = {arm: row["p"] for arm, row in rows.items() if "p" in row}
-    for arm, survives in holm(tested).items():
-        rows[arm]["significant"] = survives
+    tested = [row for row in rows.values() if "p" in row]
+    for row, p in zip(tested, holm([row["p"] for row in tested]), strict=True):
+        row["significant"] = p <= LEVEL
     return rows
 
 
@@ -99,23 +101,10 @@ def _median(steps: Sequence[float]) -> float | None:
     return median if np.isfinite(median) else None
 
 
-def holm(p: Mapping[str, float], level: float = 0.05) -> dict[str, bool]:
-    """Which of several tests reject after Holm's correction (1979) for all of them."""
-    found, going = {}, True
-    for i, name in enumerate(sorted(p, key=lambda name: p[name])):
-        going = going and p[name] <= level / (len(p) - i)
-        found[name] = going
-    return found
-
-
 def last(runs: Sequence[RunData], *keys: str) -> float | None:
     """The mean over runs and keys of the last value of each key; None where a run has none."""
     values = [[row[key] for row in run.rows if row.get(key) is not None][-1:] for run in runs for key in keys]
     return float(np.mean(values)) if all(values) else None
-
-
-def _limits(interval: statistics.Interval) -> dict[str, float]:
-    return {"mean": float(interval.point), "low": float(interval.low), "high": float(interval.high)}
 
 
 def costs() -> dict[str, float]:
@@ -170,10 +159,7 @@ def draw(name: str, games: Mapping[str, Any], path: Path) -> Path:
     order = [arm for arm in first if "difference" in first[arm]]
     order.sort(key=lambda arm: -first[arm]["difference"]["mean"])
     panels = {
-        game: {
-            arm.partition("_")[2]: statistics.Interval(*rows[arm]["difference"].values(), kind="Welch's t")
-            for arm in order
-        }
+        game: {arm.partition("_")[2]: statistics.Interval(*rows[arm]["difference"].values()) for arm in order}
         for game, rows in games.items()
     }
     remains = [any(rows[arm]["significant"] for rows in games.values()) for arm in order]
