@@ -35,7 +35,7 @@ from ..arms import SCORES
 from ..command_line import flags as config_flags
 from ..runs import collect
 from ..runs.run_data import RunData
-from .populations import RESULTS
+from .populations import LEVEL, RESULTS
 
 ROOT = RESULTS.parents[1]
 PAGE, README = ROOT / "docs" / "answers.md", ROOT / "README.md"
@@ -80,18 +80,10 @@ def surviving(differences: Mapping[str, Sequence[np.ndarray]]) -> set[str]:
     Args:
         differences: name -> runs of each arm, as `difference` gives them.
     """
-    kept: set[str] = set()
-    while True:  # those whose p is below the limit of the smallest one that is left
-        limit = 1 - (1 - 0.95) / max(len(differences) - len(kept), 1)
-        found = {
-            name: statistics.contrast(arms, WEIGHTS[: len(arms)], limit)
-            for name, arms in differences.items()
-            if name not in kept
-        }
-        more = {name for name, interval in found.items() if interval.low > 0 or interval.high < 0}
-        if not more:
-            return kept
-        kept |= more
+    p = [statistics.contrast_p(arms, WEIGHTS[: len(arms)]) for arms in differences.values()]
+    return {
+        name for name, corrected in zip(differences, statistics.holm(p), strict=True) if corrected < LEVEL
+    }
 
 
 def number(what: str, results: Path = RESULTS) -> str:

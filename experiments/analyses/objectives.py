@@ -25,8 +25,7 @@ from ..runs import collect
 from ..runs.json_values import limits
 from ..runs.run_data import RunData
 from . import output
-from .populations import RESULTS
-from .predictors import LEVEL, holm
+from .populations import LEVEL, RESULTS
 
 CAMPAIGN = RESULTS / "catch_objectives"
 BASELINES = {"joint": "rl_only_256", "decoupled": "frozen_random"}
@@ -90,8 +89,8 @@ def of_game(game: str, members: Mapping[str, Sequence[RunData]], baseline: str) 
             row["p"] = float(statistics.welch_p(*areas))
         rows[arm] = row
     tested = [row for row in rows.values() if "p" in row]
-    for row, p in zip(tested, holm([row["p"] for row in tested]), strict=True):
-        row["significant"] = p <= LEVEL
+    for row, p in zip(tested, statistics.holm([row["p"] for row in tested]), strict=True):
+        row["significant"] = bool(p <= LEVEL)
     return rows
 
 

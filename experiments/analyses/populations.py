@@ -24,6 +24,8 @@ RESULTS = Path(__file__).resolve().parents[1] / "results"
 CHOSEN = "catch_runs.json"
 """In `RESULTS`: [{"campaign", "games", "seeds", "arms"}], the runs that are analysed together. A list, since
 campaigns go on: what is made of it stays the same."""
+LEVEL = 0.05
+"""Below which the p value of a test is, corrected where there are several, of what is told apart."""
 POINTS = 10_001
 """Values of a population that stands for a continuous distribution."""
 LEARNS = 0.3

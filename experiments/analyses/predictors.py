@@ -14,13 +14,13 @@ import numpy as np
 from absl import flags
 
 from srl_jax.files import display
-from srl_jax.statistics import ENOUGH
+from srl_jax.statistics import ENOUGH, holm
 
 from ..command_line import flags as config_flags
 from ..drawing import plots
 from ..runs.run_data import RunData
 from . import output, populations
-from .populations import ChosenArm
+from .populations import LEVEL, ChosenArm
 
 MOMENTS = (9_000, 18_000)
 """Env steps of the evaluations that predict."""
@@ -41,7 +41,6 @@ BLOCK = 5
 PERMUTATIONS = 100_000
 REPETITIONS = 10_000
 """Of the bootstrap of arms."""
-LEVEL = 0.05
 _AT_ONCE = 2_000
 
 
@@ -176,15 +175,6 @@ def drawn_again(strata: Sequence[Stratum], level: str, seed: int) -> np.ndarray:
     return total
 
 
-def holm(p: Sequence[float]) -> list[float]:
-    """Holm's p values of several tests (Holm 1979)."""
-    order = np.argsort(p)
-    adjusted = np.maximum.accumulate(np.array(p)[order] * np.arange(len(p), 0, -1))
-    found = np.empty(len(p))
-    found[order] = np.minimum(adjusted, 1)
-    return found.tolist()
-
-
 def analyse(arms: Sequence[ChosenArm]) -> list[dict[str, Any]]:
     """A row a level, moment, game and key, as JSON has it; the return so far is in it and is not tested."""
     rows = []
@@ -198,7 +188,7 @@ def analyse(arms: Sequence[ChosenArm]) -> list[dict[str, Any]]:
                     rows.append(row | _row(strata, level, key))
     tested = [row for row in rows if row["p"] is not None]
     for row, p in zip(tested, holm([row["p"] for row in tested]), strict=True):
-        row["holm"] = round(p, 5)
+        row["holm"] = round(float(p), 5)
     return rows
 
 

@@ -49,6 +49,8 @@ from srl_jax.statistics.intervals import (
 from srl_jax.statistics.power import MOST, runs_needed, smallest_effect, welch_power
 from srl_jax.statistics.student import (
     contrast,
+    contrast_p,
+    holm,
     mean_difference,
     mean_interval,
     stratified_interval,
@@ -61,7 +63,7 @@ from srl_jax.statistics.table import runs_text, summary
 __all__ = [
     "AGGREGATES", "BOOTSTRAP", "ENOUGH", "MOST", "NARROW", "NONE", "STRATIFIED", "STUDENT", "WELCH",
     "Interval", "area_under_curve", "at_equal_steps", "bootstrap", "bootstrap_difference", "contrast",
-    "estimate", "estimate_difference", "human_normalised", "interquartile_mean", "mean",
+    "contrast_p", "estimate", "estimate_difference", "holm", "human_normalised", "interquartile_mean", "mean",
     "mean_difference", "mean_interval", "median", "optimality_gap", "percentile_interval",
     "performance_profile", "probability_of_improvement", "runs_needed", "runs_text", "smallest_effect",
     "steps_to", "stratified_interval", "summary", "t_probability", "t_quantile", "welch_p",

@@ -78,13 +78,17 @@ def contrast(groups: Sequence[Any], weights: Any, level: float = 0.95) -> Interv
     Raises:
         ValueError: see `mean_interval`.
     """
-    means, variances, freedoms = zip(*map(_moments, groups), strict=True)
-    parts = [weight**2 * variance for weight, variance in zip(weights, variances, strict=True)]
-    total = _spread(np.sum(parts, axis=0))
-    lost = [part**2 / max(freedom, 1) for part, freedom in zip(parts, freedoms, strict=True)]
-    point = np.sum([weight * x for weight, x in zip(weights, means, strict=True)], axis=0)
-    kind = STRATIFIED if min(freedoms) else NONE
-    return _interval(point, total, total**2 / np.sum(lost, axis=0), level, kind)
+    point, variance, freedom, kind = _contrast(groups, weights)
+    return _interval(point, variance, freedom, level, kind)
+
+
+def contrast_p(groups: Sequence[Any], weights: Any) -> np.ndarray:
+    """The two-sided p value of the test that a weighted sum of means is 0, float64 [...].
+
+    Takes what `contrast` takes, whose interval leaves out 0 where this is below 1 - level; NaN where that has
+    no interval.
+    """
+    return _p(*_contrast(groups, weights)[:3])
 
 
 def mean_difference(x: Any, y: Any, level: float = 0.95) -> Interval:
@@ -113,8 +117,26 @@ def welch_p(x: Any, y: Any) -> np.ndarray:
 
     Takes what `mean_difference` takes; NaN where that has no interval.
     """
-    point, variance, freedom, _ = _welch(x, y)
-    return 1 - t_probability(np.abs(point) / np.sqrt(_spread(variance)), freedom)
+    return _p(*_welch(x, y)[:3])
+
+
+def holm(p: Any) -> np.ndarray:
+    """The p values of several tests, corrected for their number (Holm, Scand. J. Statistics 6, 1979).
+
+    Where those below the level are taken as differences, the chance that any of them is none is at most the
+    level. NaN counts as a test and stays.
+
+    Args:
+        p: float64 [tests].
+
+    Returns:
+        float64 [tests], at most 1, in the order of p.
+    """
+    p = np.asarray(p, np.float64)
+    order = np.argsort(p)
+    found = np.empty_like(p)
+    found[order] = np.minimum(np.maximum.accumulate(p[order] * np.arange(len(p), 0, -1)), 1)
+    return found
 
 
 def t_probability(t: Any, freedom: Any) -> np.ndarray:
@@ -180,6 +202,20 @@ def _welch(x: Any, y: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
     share = v / _spread(v + w)
     freedom = 1 / (share**2 / max(m, 1) + (1 - share) ** 2 / max(n, 1))
     return mine - theirs, v + w, freedom, WELCH if m and n else NONE
+
+
+def _contrast(groups: Sequence[Any], weights: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+    """The weighted sum of means, its variance, the degrees of freedom (Satterthwaite), the kind."""
+    means, variances, freedoms = zip(*map(_moments, groups), strict=True)
+    parts = [weight**2 * variance for weight, variance in zip(weights, variances, strict=True)]
+    total = _spread(np.sum(parts, axis=0))
+    lost = [part**2 / max(freedom, 1) for part, freedom in zip(parts, freedoms, strict=True)]
+    point = np.sum([weight * x for weight, x in zip(weights, means, strict=True)], axis=0)
+    return point, total, total**2 / np.sum(lost, axis=0), STRATIFIED if min(freedoms) else NONE
+
+
+def _p(point, variance, freedom) -> np.ndarray:
+    return 1 - t_probability(np.abs(point) / np.sqrt(_spread(variance)), freedom)
 
 
 def _spread(variance: np.ndarray) -> np.ndarray:

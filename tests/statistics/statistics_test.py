@@ -17,8 +17,10 @@ from srl_jax.statistics import (
     bootstrap,
     bootstrap_difference,
     contrast,
+    contrast_p,
     estimate,
     estimate_difference,
+    holm,
     human_normalised,
     interquartile_mean,
     mean,
@@ -261,6 +263,22 @@ def test_intervals_and_p_values_of_differences_are_scipys(x, y):
     assert difference[:3] == pytest.approx((np.mean(x) - np.mean(y), low, high), rel=1e-6, abs=1e-9)
     if abs(p - 0.05) > 1e-6:
         assert (p < 0.05) == (not difference.low <= 0 <= difference.high)
+
+
+def test_holm_by_hand():
+    assert holm([0.01, 0.04, 0.03, 0.5]) == pytest.approx([0.04, 0.09, 0.09, 0.5])
+    assert holm([0.04, 0.01, 0.03]) == pytest.approx([0.06, 0.03, 0.06])  # stops at the first above 0.05
+    np.testing.assert_allclose(holm([np.nan, 0.01]), [np.nan, 0.02])
+    assert holm([]).shape == (0,)
+
+
+def test_a_contrast_has_the_p_of_its_interval():
+    groups = np.random.default_rng(3).normal(size=(4, 6)) * [[1], [2], [3], [1]] + [[2], [0], [0], [0]]
+    weights = [1, -1, -1, 1]
+    p = contrast_p(groups, weights)
+    assert contrast_p(groups[:2], [1, -1]) == pytest.approx(welch_p(*groups[:2]))
+    assert contrast(groups, weights, 1 - p + 1e-5).low < 0 < contrast(groups, weights, 1 - p - 1e-5).low
+    assert np.isnan(contrast_p([groups[0], [1.0]], [1, -1]))
 
 
 def test_differences_of_real_runs():

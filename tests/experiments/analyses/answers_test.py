@@ -2,10 +2,10 @@
 
 import json
 
+import numpy as np
 import pytest
 
 from experiments.analyses import answers
-from srl_jax import statistics
 from srl_jax.errors import ConfigError
 
 
@@ -60,18 +60,23 @@ def test_a_mark_that_means_nothing_is_an_error(tmp_path, what, said):
         answers.filled(f"<!--{what}-->?<!---->", results)
 
 
-def test_what_survives_holms_correction(monkeypatch):
+def test_what_survives_holms_correction():
     """The smallest p is compared with 0.05 over all of them, the next one with 0.05 over those left."""
-    limits = {"a": 0.01, "b": 0.02, "c": 0.04, "d": 0.03}
+    x, rest = np.array([0.0, 1.0, 2.0, 3.0]), np.array([1.0, 2.0])
 
-    def contrast(arms, weights, level):
-        low = 1 - limits[arms] - level  # above 0 where p is below 1 - level
-        return statistics.Interval(1.0, low, 2.0, "")
+    def shifted(by: float) -> list[np.ndarray]:
+        return [x + by, x]
 
-    monkeypatch.setattr(answers.statistics, "contrast", contrast)
-    assert answers.surviving({name: name for name in "abc"}) == {"a", "b", "c"}
-    assert answers.surviving({name: name for name in "bd"}) == {"b", "d"}
-    assert answers.surviving({name: name for name in "bdc"}) == set()
+    shifts = {"a": 3.3, "b": 2.9, "c": 2.5, "none": 0.1}  # p of 0.011, 0.019, 0.034 and 0.92
+    arms = {name: shifted(by) for name, by in shifts.items()} | {"two": [x + 9, x, rest, rest]}
+    assert answers.surviving(arms) == {"two", "a"}  # of 5: 0.0125 is the limit of the second, 0.0167 of b
+    assert answers.surviving({name: arms[name] for name in "ab"}) == {"a", "b"}
+    assert answers.surviving({name: arms[name] for name in "bc"}) == {"b", "c"}
+    assert answers.surviving({name: arms[name] for name in ("b", "none", "two")}) == {"b", "two"}
+    assert answers.surviving({name: arms[name] for name in ("c", "none", "two")}) == {"two"}
+    assert (
+        answers.surviving({"c": arms["c"], "one": [x[:1], x[:1]]}) == set()
+    )  # one that can't be tested counts
 
 
 def test_every_figure_of_a_packed_campaign_is_drawn_again():

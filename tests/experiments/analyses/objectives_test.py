@@ -54,11 +54,6 @@ def test_numbers_by_hand(campaign):
     assert text.index("| good |") < text.index("| none |")
 
 
-def test_holm_stops_at_the_first_test_that_does_not_reject():
-    assert [p <= objectives.LEVEL for p in objectives.holm([0.04, 0.01, 0.03])] == [False, True, False]
-    assert [p <= objectives.LEVEL for p in objectives.holm([0.05])] == [True]
-
-
 def test_what_a_run_has_not_is_none(campaign):
     (run, *_) = packing.read(campaign)
     assert objectives.last([run], "diag/none") is None

@@ -40,10 +40,6 @@ def test_without_a_spread_there_is_none():
     assert np.isnan(predictors.correlations(predictors.moments(np.ones(4), np.arange(4), np.arange(4)))).all()
 
 
-def test_holm_by_hand():
-    assert predictors.holm([0.01, 0.04, 0.03, 0.5]) == pytest.approx([0.04, 0.09, 0.09, 0.5])
-
-
 def test_a_seed_changes_places_alike_in_all_arms_and_stays_in_its_block():
     rng = np.random.default_rng(0)
     strata = [_stratum(rng, seeds, 1) for seeds in (range(10, 15), range(10), range(5))]
