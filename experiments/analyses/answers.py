@@ -80,10 +80,8 @@ def surviving(differences: Mapping[str, Sequence[np.ndarray]]) -> set[str]:
     Args:
         differences: name -> runs of each arm, as `difference` gives them.
     """
-    p = [statistics.contrast_p(arms, WEIGHTS[: len(arms)]) for arms in differences.values()]
-    return {
-        name for name, corrected in zip(differences, statistics.holm(p), strict=True) if corrected < LEVEL
-    }
+    tests = [statistics.contrast_p(arms, WEIGHTS[: len(arms)]) for arms in differences.values()]
+    return {name for name, p in zip(differences, statistics.holm(tests), strict=True) if p < LEVEL}
 
 
 def number(what: str, results: Path = RESULTS) -> str:
