@@ -105,26 +105,20 @@ _DOPAMINE = {**_100K, "encoder": "nature:padding=same,init=xavier", "beta": 0.5,
 _DRQ = {
     **_100K,
     "encoder": _DOPAMINE["encoder"],
-    "rl": "drq:n_step=10,shared_hidden=true,slow=none,copies=1,target_copies=1,view=shift+intensity",
+    "rl": "drq:shared_hidden=true,init=xavier,slow=none,copies=1,target_copies=1,view=shift+intensity",
     "eps_train": 1.0,
     "eps_final": 0.1,
     "eps_anneal_steps": 6_600,
     "eps_eval": 0.05,
 }
-_OF_SPR = {
-    **_JOINT_100K,
-    **_VIEW,
-    "updates_per_step": 2,
-    "learn_start": 2_000,
-    "objectives": ("spr:projection=rl,target=stopped,importance=true",),
-}
+_OF_SPR = {**_JOINT_100K, **_VIEW, "updates_per_step": 2, "learn_start": 2_000, "eps_train": 1.0}
 _SPR = {
     **_100K,
     **PROTOCOLS["spr_100k"],
     **_OF_SPR,
+    "objectives": ("spr:projection=rl,target=stopped,importance=true",),
     "encoder": "nature:end=min_max",
     "rl": "rainbow:n_step=10,noisy_std=0.5,hidden=256,priority=kl,slow=none",
-    "eps_train": 1.0,
     "eps_anneal_steps": 2_000,
     "beta_anneal_steps": 100_000,
     "max_grad_norm": 10.0,
@@ -132,12 +126,17 @@ _SPR = {
 _SPR_JAX = {
     **_DOPAMINE,
     **_OF_SPR,
+    "objectives": ("spr:projection=rl,target=stopped,importance=true,init=xavier",),
     "encoder": "nature:padding=same,init=xavier,end=min_max",
     "rl": "rainbow:n_step=10,noisy_std=0.5,shared_hidden=true,slow=none",
-    "eps_train": 1.0,
     "eps_anneal_steps": 4_000,
 }
-_SLOW = "slow=ema,slow_tau=0.995,act_with=slow"
+_SR_SPR = {
+    **_SPR_JAX,
+    "rl": "rainbow:noisy=false,n_step=10,shared_hidden=true,init=xavier,slow=ema,act_with=slow",
+    "objectives": ("spr:projection=rl,tau=0.995,importance=true,init=xavier",),
+    "reset": "all",
+}
 
 _ATARI100K: dict[str, dict[str, Any]] = {
     "der": _DER,
@@ -148,7 +147,7 @@ _ATARI100K: dict[str, dict[str, Any]] = {
     },
     "otrainbow": {
         **_DOPAMINE,
-        "rl": "rainbow:double=false,dueling=false,noisy=false,n_step=3",
+        "rl": "rainbow:double=false,dueling=false,noisy=false,n_step=3,init=xavier",
         "updates_per_step": 8,
         "learn_start": 20_000,
         "slow_update_every": 4_000,  # of eight updates an env step
@@ -163,25 +162,20 @@ _ATARI100K: dict[str, dict[str, Any]] = {
     "spr": _SPR,
     "spr_resets": {**_SPR_JAX, "reset": "head_last", "reset_every": 20_000, "reset_last": 80_000},
     "sr_spr": {
-        **_SPR_JAX,
-        "rl": f"rainbow:noisy=false,n_step=10,shared_hidden=true,{_SLOW}",
-        "objectives": ("spr:projection=rl,tau=0.995,importance=true",),
+        **_SR_SPR,
         "updates_per_step": 8,
-        "reset": "all",
         "reset_every": 5_000,
         "reset_last": 95_000,
         "shrink": 0.8,
     },
     "bbf": {
-        **_SPR_JAX,
+        **_SR_SPR,
         "encoder": "impala:width=4,features=0,end=min_max,init=xavier",
-        "rl": f"rainbow:noisy=false,n_step=10,hidden=2048,shared_hidden=true,{_SLOW}",
-        "objectives": ("spr:projection=rl,tau=0.995,importance=true",),
+        "rl": f"{_SR_SPR['rl']},hidden=2048",
         "n_anneal": "10->3@10000",
         "gamma": 0.997,
         "gamma_anneal": "0.97->0.997@10000",
         "weight_decay": 0.1,
-        "reset": "all",
         "reset_every": 20_000,
         "reset_last": 80_000,
         "shrink": 0.5,

@@ -113,7 +113,7 @@ INITIALISERS = {
     "xavier": lambda fan_in: (xavier_uniform(fan_in), zeros),
     "orthogonal": lambda fan_in: (orthogonal(fan_in), zeros),
 }
-"""{name: fan_in -> (the initialiser of a convolution's kernel, that of its bias)}."""
+"""{name: fan_in -> (the initialiser of a layer's kernel, that of its bias)}."""
 
 
 def zero_sum(init):
@@ -173,20 +173,26 @@ class Layer(nn.Module):
 
 
 class Dense(Layer):
-    """A linear layer, float32 [B, inputs] -> [B, features]; PyTorch's default initialisation."""
+    """A linear layer, float32 [B, inputs] -> [B, features].
+
+    Attributes:
+        features: outputs.
+        initial: a key of `INITIALISERS`.
+    """
 
     features: int
+    initial: str = "pytorch"
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        init = uniform_fan_in(x.shape[-1])
+        init, bias_init = INITIALISERS[self.initial](x.shape[-1])
         kernel = self.weights("kernel", init, (x.shape[-1], self.features))
-        bias = self.weights("bias", init, (self.features,))
+        bias = self.weights("bias", bias_init, (self.features,))
         return x @ kernel + bias
 
 
 class WideDense(Layer):
-    """`Dense` for far more outputs than inputs; its kernel is [features, inputs], as PyTorch keeps it.
+    """`Dense` for far more outputs than inputs; its kernel is [features, inputs], as PyTorch has it.
 
     The product that gives the inputs' gradient then runs along the rows of a kernel that may have 10M
     numbers. The bias is added as a product with ones, whose gradient is one, too: as a sum over the batch
@@ -328,19 +334,21 @@ class NoisyDense(Layer):
     Attributes:
         features: outputs.
         std: sigma starts as std / sqrt(inputs), the thesis' "noisy std".
+        initial: of the means, a key of `INITIALISERS`.
     """
 
     features: int
     std: float = 0.1
+    initial: str = "pytorch"
 
     @nn.compact
     def __call__(self, x: Array, noise: Array | None) -> Array:
         """float32 [B, inputs], and `factorised_noise` [inputs + features] or None -> [B, features]."""
         inputs = x.shape[-1]
-        init = uniform_fan_in(inputs)
+        init, bias_init = INITIALISERS[self.initial](inputs)
         sigma = nn.initializers.constant(self.std / math.sqrt(inputs), jnp.float32)
         kernel = self.weights("kernel", init, (inputs, self.features))
-        bias = self.weights("bias", init, (self.features,))
+        bias = self.weights("bias", bias_init, (self.features,))
         kernel_sigma = self.weights("kernel_sigma", sigma, (inputs, self.features))
         bias_sigma = self.weights("bias_sigma", sigma, (self.features,))
         if noise is None:

@@ -31,10 +31,19 @@ SMALL = {
 
 GAMES = (
     "Catch", "CatchDistractor", *(f"catch:ball=2,background={kind}" for kind in BACKGROUNDS),
-    "examples.own_environment:Dot-v0", "examples.own_environment:Dot-v0,grey=true,frame_skip=2",
+    "examples.own_environment:Dot-v0", "examples.own_environment:Dot-v0,grey=true,frame_skip=2", "Pong",
 )  # fmt: skip
 
-VIEWS = ("none", "shift", "intensity", "crop_pad_crop", "shift+intensity", "shift@each", "intensity@each")
+VIEWS = (
+    "none",
+    "shift",
+    "intensity",
+    "crop_pad_crop",
+    "shift+intensity",
+    "shift@each",
+    "intensity@each",
+    "crop_pad_crop@each",
+)
 WEIGHTS = ("0.5", "0", "1->0.01@80", "ratio:0.1", "ratio:0.1->0.01@80")
 
 ALWAYS = {"hidden": 16, "atoms": 11, "outputs": 16, "quantiles": 8, "target_quantiles": 6}
@@ -150,7 +159,7 @@ def draw(number: int, encoder: str = "") -> Draw:
     for field, choices in SETTINGS.items():
         if rng.random() < 1 / 10:
             values[field] = rng.choice(choices)
-    if rng.random() < (0.4 if mode.name == "joint" else 0.04):
+    if rng.random() < (0.7 if mode.name == "joint" else 0.04):
         values["gate"] = rng.choice([*modes.GATES])
     # What has to be said of both is left out now and then, and is then refused.
     if "reset" in values and rng.random() < 0.9:

@@ -276,6 +276,15 @@ def test_a_convolution_starts_as_asked():
     assert np.abs(centred["kernel"].sum((0, 1))).max() < 1e-6
 
 
+@pytest.mark.parametrize("layer", [Dense, NoisyDense])
+def test_a_linear_layer_starts_as_asked(layer):
+    more = [None] if layer is NoisyDense else []
+    init = jax.jit(layer(20, initial="xavier").init)
+    params = init(jax.random.key(0), jnp.zeros((1, 30)), *more)["params"]
+    bound = (6 / (30 + 20)) ** 0.5
+    assert 0.98 * bound < np.abs(params["kernel"]).max() <= bound and not params["bias"].any()
+
+
 def test_init_scale_multiplies_the_kernel():
     x = jnp.zeros((1, 3, 3, 2))
     whole, tenth = (

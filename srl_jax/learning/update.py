@@ -318,6 +318,8 @@ def make_update(
         step = state.step + 1
         td_error = extra.get(RL, {}).pop("td_error", None)
         metrics |= {f"weight/{name}": factors[name] for name in of_ratios}
+        for kind, means in (state.norms or {}).items() if of_ratios else ():
+            metrics |= {f"running_{kind}/{name}": mean for name, mean in means.items()}
         metrics |= {f"loss/{name}": jnp.mean(x) for name, x in losses.items()}
         metrics |= {f"{name}/{k}": x for name, values in extra.items() for k, x in values.items()}
         slow = follow(objectives, params, state.slow, step) if slow_follows else state.slow

@@ -23,12 +23,13 @@ def similarity(z: Array, other: Array) -> jax.Array:
 
 
 def slowness(context: Context, *, weight: float = 1.0, variability: float = 1.0) -> Objective:
-    """Pulls z_{t+1} to z_t, and z_t away from all other rows' (Jonschkowski and Brock 2015, section 4.2).
+    """Pulls z_{t+1} to z_t, and z_t away from all other rows' (Jonschkowski et al. 2017, section III).
 
-    `|z_{t+1} - z_t|^2 + variability E exp(-|z_t - z'_t|)`, the mean over the other rows of the batch:
-    temporal coherence and variability of their robotic priors (thesis, section 3.2.4). The first term alone
-    is least where all latents are the same; `variability=0` shows that. The gradient flows into the encoder
-    through all of them; there is no head.
+    `|z_{t+1} - z_t|^2 + variability E exp(-|z_t - z'_t|)`, the mean over the other rows of the batch: their
+    priors of slowness and variation, the former being the temporal coherence of Jonschkowski and Brock (2015)
+    and the slowness principle (thesis, section 3.2.4). The first term alone is least where all latents are
+    the same; `variability=0` shows that. The gradient flows into the encoder through all of them; there is no
+    head.
     """
 
     def loss(head: Params, slow_head: Params, latents: Latents, window: Window, key: jax.Array):

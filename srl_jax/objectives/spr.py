@@ -4,7 +4,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from srl_jax.layers import Conv, Dense, min_max
+from srl_jax.layers import INITIALISERS, Conv, Dense, min_max
 from srl_jax.learning.update import ema
 from srl_jax.objectives.networks import cosine_distance, functions, one_hot
 from srl_jax.specs import check_choice, check_size, needs
@@ -24,9 +24,11 @@ class Transition(nn.Module):
 
     Attributes:
         shape: (H', W', C') of the map, H' W' C' = D. A latent behind a bottleneck is a map of one pixel.
+        initial: how its layers start, a key of `srl_jax.layers.INITIALISERS`.
     """
 
     shape: tuple[int, ...]
+    initial: str = "pytorch"
 
     @nn.compact
     def __call__(self, z: Array, action: Array) -> Array:
@@ -34,8 +36,8 @@ class Transition(nn.Module):
         side = 3 if max(height, width) > 1 else 1
         planes = jnp.broadcast_to(action[:, None, None], (z.shape[0], height, width, action.shape[-1]))
         x = jnp.concatenate([z.reshape(-1, *self.shape), planes], -1)
-        x = nn.relu(Conv(channels, side, 1, padding="SAME", name="first")(x))
-        x = nn.relu(Conv(channels, side, 1, padding="SAME", name="second")(x))
+        x = nn.relu(Conv(channels, side, 1, self.initial, padding="SAME", name="first")(x))
+        x = nn.relu(Conv(channels, side, 1, self.initial, padding="SAME", name="second")(x))
         return min_max(x.reshape(z.shape))
 
 
@@ -51,6 +53,7 @@ def spr(
     tau: float = 0.99,
     mask: bool = True,
     importance: bool = False,
+    init: str = "pytorch",
 ) -> Objective:
     """Predicts projections of the next `steps` latents (Schwarzer et al. 2021, section 2; figure 2).
 
@@ -72,6 +75,7 @@ def spr(
         mask: whether steps behind the end of an episode count 0; the authors' code leaves out the last
             observation of an episode, too, and takes a lost life for an end.
         importance: whether the loss is multiplied by replay's importance weights, as in the authors' code.
+        init: how transition, predictor and an own projection start, a key of `srl_jax.layers.INITIALISERS`.
 
     Raises:
         ValueError: with `projection=rl`, where RL's head is not trained or has no such layer.
@@ -80,19 +84,20 @@ def spr(
     check_size("hidden", hidden)
     check_choice("projection", projection, PROJECTIONS)
     check_choice("target", target, TARGETS)
+    check_choice("init", init, INITIALISERS)
     features = context.features
     shape = context.map_shape or (1, 1, features)
-    init_transition, transition = functions(Transition(shape), features, context.num_actions)
+    init_transition, transition = functions(Transition(shape, init), features, context.num_actions)
     parts = {"transition": init_transition}
     if projection == "own":
-        parts["projection"], project = functions(Dense(hidden), features)
+        parts["projection"], project = functions(Dense(hidden, init), features)
         where, outputs, reads = "projection", hidden, {}
     else:
         where, outputs, part, project = _rl_layer(context)
         reads = {where: part}
-    parts["predictor"], predict = functions(Dense(outputs), outputs)
+    parts["predictor"], predict = functions(Dense(outputs, init), outputs)
 
-    def init(key: jax.Array) -> Params:
+    def drawn(key: jax.Array) -> Params:
         keys = jax.random.split(key, len(parts))
         return {name: draw(k) for (name, draw), k in zip(parts.items(), keys, strict=True)}
 
@@ -113,7 +118,7 @@ def spr(
         return jnp.mean(losses, 0) * (window.weight if importance else 1.0), {}
 
     slow = ema(tau) if target == "slow" else None
-    return Objective(init, loss, weight, horizon=steps, slow=slow, reads=reads)
+    return Objective(drawn, loss, weight, horizon=steps, slow=slow, reads=reads)
 
 
 def _rl_layer(context: Context) -> Layer:

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import jax
 
 from srl_jax.augment import make_view
+from srl_jax.layers import INITIALISERS
 from srl_jax.learning.update import ema, periodic
 from srl_jax.plugins import Registry
 from srl_jax.rl.heads import QNetwork
@@ -87,6 +88,7 @@ def q_learner(
     alpha: float = 0.5,
     hidden: int = 512,
     shared_hidden: bool = False,
+    init: str = "pytorch",
     munchausen: bool = False,
     munchausen_alpha: float = 0.9,
     munchausen_tau: float = 0.03,
@@ -113,6 +115,7 @@ def q_learner(
         alpha: the priority exponent (Schaul et al. 2016).
         hidden: width of each stream's hidden layer.
         shared_hidden: the streams of a dueling network have one hidden layer, as Dopamine's have.
+        init: how the head's layers start, the means of noisy ones, too; `srl_jax.layers.INITIALISERS`.
         munchausen: the reward has a share of the action's log-probability under the softmax policy added,
             and the target is of that policy (Vieillard et al. 2020); see `munchausen_return`.
         munchausen_alpha, munchausen_tau, munchausen_clip: the share, the temperature, and the least bonus.
@@ -141,6 +144,7 @@ def q_learner(
         raise ValueError("alpha must be at most 1")
     for option, value, choices in (
         ("slow", slow, SLOW), ("act_with", act_with, ACTORS), ("target", target, N_STEP_VIEWS),
+        ("init", init, INITIALISERS),
     ):  # fmt: skip
         check_choice(option, value, choices)
     if munchausen and double:
@@ -162,7 +166,7 @@ def q_learner(
         values=values,
         network=QNetwork(
             context.num_actions, values.outputs, hidden, dueling, noisy, noisy_std, values.prior,
-            shared_hidden and dueling, values.taus.cosines,
+            shared_hidden and dueling, values.taus.cosines, init,
         ),
         features=context.features,
         step_view=N_STEP_VIEWS[target],

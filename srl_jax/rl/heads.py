@@ -23,6 +23,7 @@ class QNetwork(nn.Module):
         shared_hidden: whether the two streams of a dueling network have one hidden layer, as Dopamine's.
         cosines: where above 0, latents are multiplied by an embedding of shares of probability, taus, in so
             many cosines: `z * ReLU(linear(cos(pi i tau)))`, i from 0 (Dabney et al. 2018b, equation 4).
+        initial: how its layers start, a key of `srl_jax.layers.INITIALISERS`.
     """
 
     num_actions: int
@@ -34,6 +35,7 @@ class QNetwork(nn.Module):
     prior: tuple[float, ...] | None = None
     shared_hidden: bool = False
     cosines: int = 0
+    initial: str = "pytorch"
 
     @nn.compact
     def __call__(self, z: Array, noise: Array | None, taus: Array | None = None) -> Array:
@@ -46,7 +48,7 @@ class QNetwork(nn.Module):
         """
         if taus is not None:
             angles = jnp.pi * taus[..., None] * jnp.arange(self.cosines, dtype=jnp.float32)
-            embedded = nn.relu(Dense(z.shape[-1], name="embedding")(jnp.cos(angles)))
+            embedded = nn.relu(Dense(z.shape[-1], self.initial, name="embedding")(jnp.cos(angles)))
             z = (z[:, None] * embedded).reshape(-1, z.shape[-1])
         q = self._outputs(z, noise)
         if taus is None:
@@ -62,8 +64,8 @@ class QNetwork(nn.Module):
 
         def layer(name: str, features: int, x: Array) -> Array:
             if self.noisy:
-                return NoisyDense(features, self.noisy_std, name=name)(x, parts.pop(0))
-            return Dense(features, name=name)(x)
+                return NoisyDense(features, self.noisy_std, self.initial, name=name)(x, parts.pop(0))
+            return Dense(features, self.initial, name=name)(x)
 
         shared = nn.relu(layer("hidden", self.hidden, z)) if self.shared_hidden else None
 

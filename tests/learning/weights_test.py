@@ -128,7 +128,9 @@ def test_a_ratio_holds_the_norm_of_an_objectives_gradient_on_the_encoder():
     last = run_of("summed")[-1]
     means = last["norms"]["gradient"]
     for name, ratio in (("far", 0.1), ("near", 0.5)):
-        held = last[f"weight/{name}"] * means[name] / means[RL]
+        running = {n: last[f"running_gradient/{n}"] for n in (name, RL)}
+        assert running == {n: means[n] for n in running}
+        held = last[f"weight/{name}"] * running[name] / running[RL]
         assert held == pytest.approx(ratio, rel=1e-4)
     assert "step" not in last["norms"]
 

@@ -14,10 +14,14 @@ import pytest
 from srl_jax import encoders, layers, objectives
 from srl_jax.augment import make_view
 from srl_jax.objectives.bisimulation import bisimulation_error
+from srl_jax.objectives.infonce import info_nce
+from srl_jax.objectives.inverse import action_cross_entropy
 from srl_jax.objectives.latent_l2 import l2_norm
 from srl_jax.objectives.networks import cosine_distance, mean_squared_error, over_others
 from srl_jax.objectives.reward import binary_cross_entropy, symlog, two_hot
-from srl_jax.objectives.slowness import similarity
+from srl_jax.objectives.slowness import similarity, squared_step
+from srl_jax.objectives.two_views import covariance_loss, cross_correlation, variance_loss
+from srl_jax.objectives.vae import gaussian_divergence
 from srl_jax.types import Context, Latents, Window
 from tests import helpers
 from tests.helpers import (
@@ -47,6 +51,30 @@ def test_a_vector_of_zeros_has_no_direction_and_no_gradient():
     zero = jnp.zeros(3)
     assert float(cosine_distance(zero, jnp.ones(3))) == 2
     assert np.all(jax.grad(cosine_distance)(zero, jnp.ones(3)) == 0)
+
+
+LOG3 = np.log(3)
+BY_HAND = {
+    # (|1 - 0| + |3 - 1|) / 2 = 1.5, less |2 - 1| + 0.5 sqrt((4 + 4) / 2) = 2, squared.
+    "bisimulation": (bisimulation_error, ([1, 3], 2, [0, 0], [0, 1], 1, [2, 2], 0.5), 0.25),
+    "a step": (squared_step, ([1, 2], [4, 6]), 25),  # 9 + 16
+    "two apart": (similarity, ([0, 0], [3, 4]), np.exp(-5)),
+    "divergence": (gaussian_divergence, ([1, 0], [0, np.log(4)]), (1 + 3 - np.log(4)) / 2),
+    "the action taken": (lambda x: action_cross_entropy(x, 1), ([0, LOG3],), np.log(4 / 3)),  # p is 3 of 4
+    # A share of 1 in 4; the second row does not count.
+    "its own column": (info_nce, ([[0, LOG3], [0, 0]], [1, 0]), [np.log(4), 0]),
+    # Variances 2 and 0.02, to which 0.0001 is added: a root of 0.14177 is 0.85823 short of 1.
+    "spread": (variance_loss, ([[0, 0], [2, 0.2]],), 0.85823 / 2),
+    "covariance": (covariance_loss, ([[1, 1], [-1, -1]],), 4),  # 2 squared, twice, over 2 features
+    "correlation": (cross_correlation, ([[1, 1], [-1, -1]], [[1, -1], [-1, 1]]), [[1, -1], [1, -1]]),
+}
+
+
+@pytest.mark.parametrize("what", BY_HAND)
+def test_what_losses_are_made_of_by_hand(what):
+    function, arguments, expected = BY_HAND[what]
+    found = function(*(np.asarray(x, np.float32) for x in arguments))
+    np.testing.assert_allclose(found, expected, rtol=2e-5)
 
 
 def test_means_over_other_valid_rows_by_hand():
@@ -120,6 +148,15 @@ def test_spr_has_a_convolutional_transition_where_the_latent_is_a_map():
     behind_a_bottleneck = objectives.spr(make_context(D))
     kernels = jax.eval_shape(behind_a_bottleneck.init, jax.random.key(0))["transition"]
     assert kernels["first"]["kernel"].shape == (1, 1, D + NUM_ACTIONS, D)
+
+
+def test_sprs_layers_start_as_asked():
+    objective = objectives.spr(make_context(24)._replace(map_shape=(2, 3, 4)), hidden=32, init="xavier")
+    head = jax.jit(objective.init)(jax.random.key(0))
+    for layer in (*head["transition"].values(), head["projection"], head["predictor"]):
+        *window, inputs, outputs = layer["kernel"].shape
+        bound = (6 / (np.prod(window) * (inputs + outputs))) ** 0.5
+        assert 0.9 * bound < np.abs(layer["kernel"]).max() <= bound and not layer["bias"].any()
 
 
 def test_a_constant_has_no_range():

@@ -126,6 +126,27 @@ def test_every_row_is_named(rows):
         assert re.search(rf"(?<![\w/]){name}(?!\w)", text), name
 
 
+def test_the_costs_of_objectives_are_those_that_were_measured():
+    rows = json.loads((ROOT / "experiments/results/bench/objectives.json").read_text(encoding="utf-8"))[
+        "rows"
+    ]
+    measured = {
+        name.removeprefix("objective_"): f"{row['figures']['ratio']['median']:.2f}"
+        for name, row in rows.items()
+    }
+    for page in (ROOT / "README.md", ROOT / "docs" / "objectives.md"):
+        table = re.findall(
+            r"(?<=\| )((?:`\w+`(?:, )?)+) \|(?:[^|]+\|)? ((?:\d\.\d\d(?:, )?)+)(?= \|)",
+            page.read_text("utf-8"),
+        )
+        told = [
+            pair
+            for names, costs in table
+            for pair in zip(re.findall(r"\w+", names), costs.split(", "), strict=True)
+        ]
+        assert len(told) == len(objectives.REGISTRY) and dict(told) == measured, page
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_code_is_python_and_json(page):
     for code in _blocks(page, "python"):

@@ -23,9 +23,12 @@ from tests.rl.rl_test import (
     BATCH,
     CONTEXT,
     FEATURES,
+    check_gradient,
+    losses_and_gradient,
     make_case,
     make_latents,
     network,
+    slope_of,
     softmax,
 )
 
@@ -83,10 +86,10 @@ def test_the_whole_target_of_a_three_step_episode_by_hand():
     np.testing.assert_allclose(np.transpose(early), [ONE_EARLY[end] for end, _ in EPISODE])
 
 
-def embedded(head, z, taus):
-    """IQN's latents of taus [B, N] in numpy: float32 [B * N, D]."""
+def embedded(head, z, taus, xp=np):
+    """IQN's latents of taus [B, N] in numpy, or in jax.numpy as `xp`: float32 [B * N, D]."""
     cosines = np.cos(np.pi * taus[..., None] * np.arange(len(head["embedding"]["kernel"])))
-    phi = np.maximum(cosines @ head["embedding"]["kernel"] + head["embedding"]["bias"], 0)
+    phi = xp.maximum(cosines @ head["embedding"]["kernel"] + head["embedding"]["bias"], 0)
     return (z[:, None] * phi).reshape(-1, z.shape[-1])
 
 
@@ -101,14 +104,14 @@ def test_iqn_is_rlax_at_the_taus_that_were_drawn(double, dueling):
     @jax.jit
     def run(head, slow_head, key):
         latents = make_latents(online, slow)
-        losses, metrics = algorithm.objective.loss(head, slow_head, latents, window, key)
+        found, gradient = losses_and_gradient(algorithm.objective, head, slow_head, latents, window, key)
         q = algorithm.q_values(head, latents.online(0)), algorithm.q_values(head, latents.online(0), key)
-        return losses, metrics["td_error"], q
+        return found, gradient, q
 
-    losses, td_error, (q, drawn_q) = run(head, slow_head, key)
+    (losses, metrics), gradient, (q, drawn_q) = run(head, slow_head, key)
 
-    def quantiles(head, z, taus):  # [B, A, N]
-        out = network(head, embedded(head, z, taus), dueling)
+    def quantiles(head, z, taus, xp=np):  # [B, A, N]
+        out = network(head, embedded(head, z, taus, xp), dueling, xp=xp)
         return out.reshape(*taus.shape, ACTIONS).transpose(0, 2, 1)
 
     draw = lambda name, n: np.asarray(jax.random.uniform(named_key(key, f"taus {name}"), (BATCH, n)))  # noqa: E731
@@ -124,14 +127,18 @@ def test_iqn_is_rlax_at_the_taus_that_were_drawn(double, dueling):
     slow_t = quantiles(slow_head, slow[offset, rows], draw("target", 5))
     chooser, z_t = (head, online) if double else (slow_head, slow)
     selector_t = quantiles(chooser, z_t[offset, rows], draw("selector", 6)).mean(-1)
+    slopes, by_rlax = [], jax.jit(jax.value_and_grad(rlax.quantile_q_learning), static_argnums=7)
     for b in rows:
         step = window.actions[b, 0], r_t[b], discount_t[b]
-        arrays = map(jnp.asarray, (out_tm1[b].T, taus[b], *step, selector_t[b][None], slow_t[b].T))
-        loss = rlax.quantile_q_learning(*arrays, 1.0)
+        arrays = out_tm1[b].T, taus[b], *step, selector_t[b][None], slow_t[b].T
+        loss, slope = by_rlax(*arrays, 1.0)
+        slopes.append(slope.T)
         np.testing.assert_allclose(losses[b], loss * window.weight[b], rtol=1e-4, atol=1e-5)
         best = slow_t[b, selector_t[b].argmax()].mean()
         error = r_t[b] + discount_t[b] * best - out_tm1[b, window.actions[b, 0]].mean()
-        np.testing.assert_allclose(td_error[b], error, rtol=1e-4, atol=1e-5)
+        np.testing.assert_allclose(metrics["td_error"][b], error, rtol=1e-4, atol=1e-5)
+    outputs = partial(quantiles, z=online[0], taus=taus, xp=jnp)
+    check_gradient(gradient, head, outputs, slopes, window.weight)
 
 
 KINDS = {
@@ -142,24 +149,10 @@ KINDS = {
 ATOMS_7 = np.linspace(-2, 4, ATOMS, dtype=np.float32)
 
 
-def reference_loss(kind, out, action, r_t, discount_t, outcome):
-    """(loss, error) of one example by rlax, where one outcome [M] stands for the state bootstrapped from."""
-    number = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
-    step = jnp.asarray(action), number(r_t), number(discount_t)
-    if kind == "categorical":  # of probabilities
-        logits = number(np.log(outcome))[None]
-        loss = rlax.categorical_double_q_learning(
-            number(ATOMS_7), number(out), *step, number(ATOMS_7), logits, jnp.zeros(1)
-        )
-        return float(loss), float(loss)
-    error = r_t + discount_t * outcome.mean() - out[action].mean()
-    if kind == "scalar":
-        return float(rlax.huber_loss(number(error))), error
-    taus = number((np.arange(ATOMS) + 0.5) / ATOMS)
-    loss = rlax.quantile_q_learning(
-        number(out).T, taus, *step, jnp.zeros((1, 1)), number(outcome)[:, None], 1.0
-    )
-    return float(loss), error
+def of_outcome(kind, out, action, r_t, discount_t, outcome):
+    """`slope_of`, where one outcome [M] stands for the last state."""
+    slow_t = np.log(outcome) if kind == "categorical" else outcome
+    return slope_of(kind, out, action, r_t, discount_t, np.zeros(1), slow_t[None])
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -171,11 +164,14 @@ def test_munchausen_is_the_paper_for_every_kind(kind):
     )  # fmt: skip
     head, slow_head = (random_params(algorithm.objective.init, seed) for seed in (1, 2))
     online, slow, window = make_case()
-    losses, metrics = jax.jit(
-        lambda *arrays: algorithm.objective.loss(*arrays[:2], make_latents(*arrays[2:]), window, None)
+    (losses, metrics), gradient = jax.jit(
+        lambda *arrays: losses_and_gradient(
+            algorithm.objective, *arrays[:2], make_latents(*arrays[2:]), window, None
+        )
     )(head, slow_head, online, slow)
 
     r_t, discount_t, offset = map(np.asarray, n_step(window.rewards, window.discounts, window.valid, 3))
+    slopes = []
     for b in range(BATCH):
         own, there = (network(slow_head, slow[k], False)[b] for k in (0, offset[b]))
         there = softmax(there) if kind == "categorical" else there
@@ -187,9 +183,12 @@ def test_munchausen_is_the_paper_for_every_kind(kind):
         bonus = np.clip(tau * np.log(softmax(q_tm1 / tau)[action]), clip, 0)
         total = r_t[b] + alpha * bonus - discount_t[b] * tau * policy @ np.log(policy)
         out = network(head, online[0], False)[b]
-        loss, error = reference_loss(kind, out, action, total, discount_t[b], policy @ there)
+        (loss, error), slope = of_outcome(kind, out, action, total, discount_t[b], policy @ there)
+        slopes.append(slope)
         np.testing.assert_allclose(losses[b], loss * window.weight[b], rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(metrics["td_error"][b], error, rtol=1e-4, atol=1e-5)
+    outputs = partial(network, z=online[0], dueling=False, xp=jnp)
+    check_gradient(gradient, head, outputs, slopes, window.weight)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -206,12 +205,14 @@ def test_drq_averages_targets_over_one_set_of_views_and_losses_over_another(kind
         left = iter(views)
         nothing = make_latents(np.full_like(views[0][0], np.nan), np.full_like(views[0][1], np.nan))
         latents = nothing._replace(of=lambda window: make_latents(*next(left)))
-        found = algorithm.objective.loss(head, slow_head, latents, window, jax.random.key(0))
+        key = jax.random.key(0)
+        found = losses_and_gradient(algorithm.objective, head, slow_head, latents, window, key)
         assert next(left, None) is None
         return found
 
-    losses, metrics = run(head, slow_head)
+    (losses, metrics), gradient = run(head, slow_head)
     r_t, discount_t, offset = map(np.asarray, n_step(window.rewards, window.discounts, window.valid, 3))
+    slopes = []
     for b in range(BATCH):
         outcomes = []
         for _, slow in views[:3]:
@@ -219,16 +220,17 @@ def test_drq_averages_targets_over_one_set_of_views_and_losses_over_another(kind
             out = softmax(out) if kind == "categorical" else out
             worth = out @ ATOMS_7 if kind == "categorical" else out.mean(-1)
             outcomes.append(out[worth.argmax()])
-        pairs = [
-            reference_loss(
-                kind, network(head, online[0], False)[b], window.actions[b, 0], r_t[b], discount_t[b],
-                np.mean(outcomes, 0),
-            )
-            for online, _ in views[3:]
-        ]  # fmt: skip
-        loss, error = np.mean(pairs, 0)
+        rest = window.actions[b, 0], r_t[b], discount_t[b], np.mean(outcomes, 0)
+        pairs = [of_outcome(kind, network(head, online[0], False)[b], *rest) for online, _ in views[3:]]
+        loss, error = np.mean([pair for pair, _ in pairs], 0)
+        slopes.append(np.stack([slope for _, slope in pairs]) / 2)
         np.testing.assert_allclose(losses[b], loss * window.weight[b], rtol=1e-4, atol=1e-5)
         np.testing.assert_allclose(metrics["td_error"][b], error, rtol=1e-4, atol=1e-5)
+
+    def outputs(head):
+        return jnp.stack([network(head, online[0], False, xp=jnp) for online, _ in views[3:]], 1)
+
+    check_gradient(gradient, head, outputs, slopes, window.weight)
 
 
 def test_streams_with_one_hidden_layer():

@@ -55,8 +55,8 @@ def make_case(seed=0):
     return online, slow, Window(np.zeros((BATCH, 7, 1, 1, 1), np.uint8), actions, *floats)
 
 
-def network(head, z, dueling, noise=None):
-    """The head in numpy: [B, A, M]; with the noise of its layers in turn, float32 [any]."""
+def network(head, z, dueling, noise=None, xp=np):
+    """The head in numpy or jax.numpy: [B, A, M]; with the noise of its layers in turn, float32 [any]."""
     noise = None if noise is None else list(noise)
 
     def layer(name, x):
@@ -69,11 +69,54 @@ def network(head, z, dueling, noise=None):
         return x @ kernel + bias
 
     def stream(name, outputs):
-        x = layer(f"{name}_out", np.maximum(layer(f"{name}_hidden", z), 0))
+        x = layer(f"{name}_out", xp.maximum(layer(f"{name}_hidden", z), 0))
         return x.reshape(len(z), outputs, -1)
 
     q = stream("q", ACTIONS)
     return q - q.mean(1, keepdims=True) + stream("v", 1) if dueling else q
+
+
+def by_rlax(family, out, action, r_t, discount_t, selector, slow_t):
+    """(loss, error), scalars, of one example by rlax; `out` and `slow_t` [A, M] are what networks give."""
+    step = action, r_t, discount_t
+    if family == "categorical":
+        atoms = jnp.linspace(-2, 4, ATOMS)
+        loss = rlax.categorical_double_q_learning(atoms, out, *step, atoms, slow_t, selector)
+        return loss, loss
+    error = rlax.double_q_learning(out.mean(-1), *step, slow_t.mean(-1), selector)
+    if family == "scalar":
+        return rlax.huber_loss(error), error
+    taus = (jnp.arange(ATOMS) + 0.5) / ATOMS
+    return rlax.quantile_q_learning(out.T, taus, *step, selector[None], slow_t.T, 1.0), error
+
+
+@partial(jax.jit, static_argnums=0)
+def slope_of(family, out, action, *rest):
+    """((loss, error), slope by the outputs) of `by_rlax`."""
+    out, *rest = (jnp.asarray(x, jnp.float32) for x in (out, *rest))
+    return jax.value_and_grad(by_rlax, argnums=1, has_aux=True)(family, out, action, *rest)
+
+
+def losses_and_gradient(objective, head, *rest):
+    """(its losses and metrics, the gradient of their mean on the head), to be traced."""
+
+    def mean(head):
+        losses, metrics = objective.loss(head, *rest)
+        return jnp.mean(losses), (losses, metrics)
+
+    (_, found), gradient = jax.value_and_grad(mean, has_aux=True)(head)
+    return found, gradient
+
+
+def check_gradient(found, head, outputs, slopes, weight):
+    """Compares a gradient with that of `mean(weight * losses)`, whose slopes [B, ...] by outputs are given.
+
+    Args:
+        outputs: head -> [B, ...].
+    """
+    slopes = np.stack(slopes) * weight.reshape(-1, *[1] * (np.ndim(slopes) - 1)) / len(weight)
+    expected = jax.jit(lambda head, slopes: jax.vjp(outputs, head)[1](slopes)[0])(head, slopes)
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-4, atol=1e-5), found, expected)
 
 
 def softmax(x):
@@ -105,16 +148,17 @@ def test_loss_is_rlax_on_the_n_step_view(kind, double, dueling, n_step):
     def run(head, slow_head, online, slow, key):
         latents = make_latents(online, slow)
         return (
-            *objective.loss(head, slow_head, latents, window, key),
+            *losses_and_gradient(objective, head, slow_head, latents, window, key),
             algorithm.q_values(head, latents.online(0)),
         )
 
-    losses, metrics, q_values = run(head, slow_head, online, slow, jax.random.key(0))
+    (losses, metrics), gradient, q_values = run(head, slow_head, online, slow, jax.random.key(0))
 
     atoms = np.linspace(-2, 4, ATOMS, dtype=np.float32)
     distributional = kind in values.PRIORITIES
     expected = lambda out: softmax(out) @ atoms if distributional else out.mean(-1)  # noqa: E731
-    td_error, unweighted = [], []
+    family = "categorical" if distributional else kind
+    td_error, unweighted, slopes = [], [], []
     for b in range(BATCH):
         total, discount, offset = 0.0, 1.0, 0
         while offset < n_step and window.valid[b, offset]:
@@ -124,34 +168,22 @@ def test_loss_is_rlax_on_the_n_step_view(kind, double, dueling, n_step):
         out_tm1 = network(head, online[0], dueling)[b]
         slow_t = network(slow_head, slow[offset], dueling)[b]
         selector = expected(network(head, online[offset], dueling)[b] if double else slow_t)
-        action, total, discount = window.actions[b, 0], jnp.float32(total), jnp.float32(discount)
-        if distributional:
-            loss = rlax.categorical_double_q_learning(
-                atoms, out_tm1, action, total, discount, atoms, slow_t, jnp.asarray(selector)
-            )
+        example = window.actions[b, 0], total, discount, selector, slow_t
+        (loss, error), slope = slope_of(family, out_tm1, *example)
+        if kind == "kl":
             best = softmax(slow_t[selector.argmax()])
             target = np.asarray(rlax.categorical_l2_project(total + discount * atoms, best, atoms))
-            target_entropy = -np.sum(target * np.log(target + 1e-30))
-            td_error.append(float(loss) - (target_entropy if kind == "kl" else 0))
-            unweighted.append(float(loss))
-        else:
-            loss = rlax.double_q_learning(
-                expected(out_tm1), action, total, discount, expected(slow_t), jnp.asarray(selector)
-            )
-            td_error.append(float(loss))
-            if kind == "scalar":
-                unweighted.append(float(rlax.huber_loss(loss)))
-                continue
-            shares = (np.arange(ATOMS, dtype=np.float32) + 0.5) / ATOMS
-            quantiles = rlax.quantile_q_learning(
-                out_tm1.T, shares, action, total, discount, jnp.asarray(selector[None]), slow_t.T, 1.0
-            )
-            unweighted.append(float(quantiles))
+            error += np.sum(target * np.log(target + 1e-30))
+        td_error.append(error)
+        unweighted.append(loss)
+        slopes.append(slope)
     unweighted = np.array(unweighted)
 
     np.testing.assert_allclose(q_values, expected(network(head, online[0], dueling)), rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(metrics["td_error"], td_error, rtol=1e-4, atol=1e-5)
     np.testing.assert_allclose(losses, unweighted * window.weight, rtol=1e-4, atol=1e-5)
+    outputs = partial(network, z=online[0], dueling=dueling, xp=jnp)
+    check_gradient(gradient, head, outputs, slopes, window.weight)
     np.testing.assert_allclose(metrics["q_max_mean"], q_values.max(-1).mean(), rtol=1e-5)
 
 
@@ -325,6 +357,17 @@ def test_normal_logits():
     assert rl.normal_logits(np.linspace(-2, 2, 5), 1.0) == (-2.0, -0.5, 0.0, -0.5, -2.0)
     assert rl.normal_logits(np.linspace(-2, 2, 5), 2.0) == (-0.5, -0.125, 0.0, -0.125, -0.5)
     assert rl.normal_logits(np.array([1.0, 2.0, 3.0]), 1.0) == (0.0, -0.5, -2.0)  # 0 is not among them
+
+
+@pytest.mark.parametrize("row", rl.REGISTRY)
+def test_every_layer_of_a_head_starts_as_asked(row):
+    options = {"hidden": 32} | ({"cosines": 16} if row == "iqn" else {})
+    algorithm = plugins.build(
+        specs.parse(specs.join(row, options | {"init": "xavier"}), rl.REGISTRY), rl.REGISTRY, CONTEXT
+    )
+    for layer in jax.jit(algorithm.objective.init)(jax.random.key(0)).values():
+        bound = (6 / sum(layer["kernel"].shape)) ** 0.5
+        assert 0.9 * bound < np.abs(layer["kernel"]).max() <= bound and not layer["bias"].any()
 
 
 @pytest.mark.parametrize("dueling", [True, False])
