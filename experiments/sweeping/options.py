@@ -56,11 +56,6 @@ def launcher_options(values: flags.FlagValues) -> dict[str, Any]:
     for name in ("gpus_per_run", "ray_address"):
         if values[name].present and found["launcher"] == "local":
             raise ConfigError(f"--{name}: only --launcher=ray takes it")
-    for name, (info, _) in _COUNTS.items():
-        try:
-            info.check(found[name])
-        except ValueError as error:
-            raise ConfigError(f"--{name}={found[name]}: {error}") from None
     return found | {"workers": found["workers"] or None}
 
 

@@ -12,7 +12,7 @@ from jax import Array
 from srl_jax.encoders.adapter import flax_encoder
 from srl_jax.encoders.lix import Mixing, mixed, tuned
 from srl_jax.encoders.options import End, Latent, Start
-from srl_jax.layers import Conv, ConvTranspose, Pads
+from srl_jax.layers import Conv, ConvTranspose, Pads, padding_of
 from srl_jax.learning.optim import ENCODER
 from srl_jax.specs import check_choice
 from srl_jax.types import Array as AnyArray
@@ -153,7 +153,9 @@ def convolutional_encoder(
     layers = tuple(layers)
     same = padding == "same"
     sizes = tuple(zip(*(layer_sides(side, layers, same, least_seen) for side in sides), strict=True))
-    pads = tuple(map(padding_between, sizes, sizes[1:], layers, itertools.repeat(same)))
+    pads = tuple(map(padding_between, sizes, sizes[1:], layers))
+    if same:
+        pads = tuple(padding_of("SAME", x, y.kernel, y.stride) for x, y in zip(sizes, layers, strict=False))
     latent = end.latent((*sizes[-1], layers[-1].channels), features, own_end)
     network = EncoderNetwork(layers, start, pads, latent, activation, lix)
     decoder = DecoderNetwork(layers, start, pads, latent, sizes[:-1], channels, sigmoid, activation)
@@ -182,18 +184,12 @@ def tied(decoder: Decoder, layers: int) -> Decoder:
     return Decoder(init, apply, {ENCODER: transposed})
 
 
-def padding_between(
-    before: tuple[int, int], after: tuple[int, int], layer: Layer, centred: bool = False
-) -> Pads:
-    """The zeros ((above, below), (left, right)) of a layer between two sizes (height, width).
-
-    They are below and on the right, or as many above as below, the odd one below, where they are centred.
-    """
-    height, width = (
+def padding_between(before: tuple[int, int], after: tuple[int, int], layer: Layer) -> Pads:
+    """The zeros ((above, below), (left, right)) of a layer between two sizes, below and on the right."""
+    below, right = (
         max(0, (y - 1) * layer.stride + layer.kernel - x) for x, y in zip(before, after, strict=True)
     )
-    above, left = (height // 2, width // 2) if centred else (0, 0)
-    return (above, height - above), (left, width - left)
+    return (0, below), (0, right)
 
 
 def steps(network: EncoderNetwork) -> Iterator[dict[str, Any]]:

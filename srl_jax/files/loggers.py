@@ -252,7 +252,7 @@ class Loggers:
                 self._loggers[text] = factory(text)(out, config)
             except Exception as error:
                 if not resumed:
-                    raise ConfigError(f"--logger={text}: {_reason(error)}") from error
+                    raise ConfigError(f"--logger={text}: {plugins.reason(error)}") from error
                 self._leave_out(text, error)
         self._each("hyperparameters", config)
 
@@ -293,7 +293,7 @@ class Loggers:
                 self._leave_out(text, error)
 
     def _leave_out(self, text: str, error: Exception) -> None:
-        self._say(f"logger {text}: {_reason(error)}; it is left out from now on")
+        self._say(f"logger {text}: {plugins.reason(error)}; it is left out from now on")
 
 
 def _own(text: str) -> tuple[str, str]:
@@ -305,12 +305,6 @@ def _own(text: str) -> tuple[str, str]:
 def _key(text: str) -> str:
     """A logger's name in `FILE`: the same where its file has moved."""
     return text.rpartition("/")[2]
-
-
-def _reason(error: Exception) -> str:
-    """An error in a line."""
-    text = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
-    return " ".join(text.split())
 
 
 def _read(path: Path) -> dict[str, int]:

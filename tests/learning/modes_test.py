@@ -1,12 +1,9 @@
 """srl_jax/learning/modes.py and agent.py: the mode x parameter-group matrix, of small but real runs."""
 
-import dataclasses
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import optax
 import pytest
 
 from srl_jax import encoders, objectives, rl
@@ -15,7 +12,7 @@ from srl_jax.learning.agent import make_agent
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.optim import RL, make_optimizer
 from srl_jax.learning.update import ema, make_init, make_update, periodic
-from srl_jax.types import Context, Objective
+from srl_jax.types import Context
 from tests.helpers import NUM_ACTIONS, all_moved, identical, make_window, random_state
 
 TERMS = ("reconstruction", "inverse")
@@ -260,47 +257,3 @@ def test_the_slow_copies_of_each_objective_move_by_its_rule_in_every_mode(mode):
         start, between, end = (state.slow[RL] for state in states)
         assert identical(start, between)
         assert identical(end, {"encoder": states[2].params["encoder"], "head": states[2].params[RL]})
-
-
-def spr(context, *, steps: int = 5, tau: float = 0.99, projection: int = 6):
-    """Slow projections of the next latents from this one and the actions (after Schwarzer et al. 2021)."""
-    inputs = context.features + context.num_actions
-    shapes = {"step": (inputs, context.features), "project": (context.features, projection)}
-    shapes["predict"] = (projection, projection)
-
-    def init(key):
-        keys = jax.random.split(key, len(shapes))
-        return {name: jax.random.normal(k, shapes[name]) for name, k in zip(shapes, keys, strict=True)}
-
-    def loss(head, slow_head, latents, window, key):
-        targets = jax.lax.stop_gradient(latents.slow(list(range(1, steps + 1))) @ slow_head["project"])
-        z, losses = latents.online(0), 0.0
-        for k in range(steps):
-            action = jax.nn.one_hot(window.actions[:, k], context.num_actions)
-            z = jnp.tanh(jnp.concatenate([z, action], -1) @ head["step"])
-            prediction = z @ head["project"] @ head["predict"]
-            cosine = optax.losses.cosine_similarity(prediction, targets[k], epsilon=1e-6)
-            losses += window.valid[:, k] * (1 - cosine)
-        return losses / steps, {}
-
-    return Objective(init, loss, horizon=steps, slow=ema(tau))
-
-
-@pytest.mark.parametrize("mode", ["joint", "pretrain"])
-def test_a_self_predictive_objective_has_a_slow_encoder_that_moves(mode, monkeypatch):
-    monkeypatch.setitem(objectives.REGISTRY, "spr", spr)
-    agent = make_agent(dataclasses.replace(small(mode), objectives=("spr",)), (FRAME, FRAME, 1), NUM_ACTIONS)
-    assert agent.horizon == 5 and agent.follow_every == 1
-    update, follow = jax.jit(agent.update.pure), jax.jit(agent.follow.__wrapped__)
-    window = make_window(size=FRAME, horizon=5)
-    start = state = random_state(agent.init)
-    slow = start.slow["spr"]
-    for _ in range(3):
-        state = follow(update(state, window, agent.hyper)[0])
-        online = {"encoder": state.params["encoder"], "head": state.params["spr"]}
-        slow = jax.tree.map(lambda s, o: 0.99 * s + 0.01 * o, slow, online)
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-7), state.slow["spr"], slow)
-    assert all_moved(state.slow["spr"], start.slow["spr"])
-    assert all_moved(state.slow["spr"]["encoder"], state.params["encoder"])
-    if mode == "joint":  # RL's own copy of the same encoder goes by RL's rule: replaced after two updates
-        assert not identical(state.slow[RL]["encoder"], state.slow["spr"]["encoder"])

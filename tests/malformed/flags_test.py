@@ -10,7 +10,7 @@ from experiments.command_line.flags import MOVED, fail
 from srl_jax.config import INFOS
 from srl_jax.errors import ConfigError
 from srl_jax.specs import Info
-from tests.malformed.conftest import CODE, EVALUATE, GIVEN, START, TRAIN
+from tests.malformed.conftest import CODE, EVALUATE, TRAIN
 
 
 def wrong(info):
@@ -158,19 +158,6 @@ TOGETHER = {
 @pytest.mark.parametrize("names", TOGETHER)
 def test_flags_that_contradict_each_other(names, refused):
     refused(*TRAIN, "--game=Catch", *TOGETHER[names], names=names)
-
-
-@pytest.mark.parametrize("flag", ["--frame_size=84", "--frame_stack=3", "--encoder=tiny:features=9"])
-def test_a_source_that_does_not_fit(flag, refused, source):
-    refused(*START, flag, names="--encoder_from")
-    if "encoder" not in flag:
-        refused(*GIVEN, flag, names="--policy_from")
-
-
-def test_a_source_is_not_overwritten(refused, source):
-    refused(*GIVEN, "--game=CatchDistractor", names="--policy_from")
-    for command in (START, GIVEN):
-        refused(*command, "--out=source", "--overwrite", names="--overwrite would delete")
 
 
 # The check itself

@@ -175,13 +175,6 @@ def test_losses_are_finite_float32_one_for_each_row(kind, name):
 
 
 @every_row
-def test_same_key_same_loss(kind, name):
-    row = build(kind, name)
-    first, second = (row.probe(row.state, row.window, jax.random.key(3)) for _ in range(2))
-    assert helpers.identical(first, second)
-
-
-@every_row
 def test_gradients_reach_the_head_and_the_encoder_and_no_slow_copy(kind, name):
     row = build(kind, name)
     _, (gradient, slow) = row.probe(row.state, row.window, row.key)

@@ -162,8 +162,3 @@ def test_what_is_checked_or_read_first_imports_nothing_that_is_slow():
         code += f"{line}\nif found := {heavy} & set(sys.modules): sys.exit({line!r} + str(found))\n"
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, timeout=60)
     assert (done.returncode, done.stderr) == (0, "")
-
-
-def test_a_command_has_the_flags_of_its_entry_point():
-    done = _command("train", "--game=Pogn", "--out=x")
-    assert done.returncode == 2 and done.stderr.startswith("error: --game=Pogn: did you mean Pong?")

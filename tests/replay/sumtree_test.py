@@ -95,16 +95,6 @@ def test_sums_of_many_blocks_are_those_of_their_leaves_alone():
     assert filled.leaves.tobytes() == leaves.tobytes()
 
 
-def test_stratified_counts_follow_the_values():
-    # 1 : 0 : 3, eight draws from eight equal parts of the total: exactly 2, 0, 6 for any seed.
-    tree = SumTree(3)
-    tree.put(np.arange(3), np.array([1.0, 0.0, 3.0]))
-    for seed in range(20):
-        drawn = tree.sample_stratified(8, np.random.default_rng(seed))
-        assert np.bincount(drawn, minlength=3).tolist() == [2, 0, 6]
-        assert drawn.dtype == np.int64
-
-
 @given(written_tree(awkward_floats), st.integers(1, 200), st.integers(0, 99))
 @settings(deadline=None, max_examples=40)
 def test_stratified_counts_are_within_two(case, n, seed):

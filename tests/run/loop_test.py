@@ -311,13 +311,6 @@ def test_updates_are_compiled_once(joint):
     assert run.agent.update.compiled._cache_size() == size
 
 
-def test_config_is_data(joint):
-    path, _ = joint
-    values = json.loads((path / "config.json").read_text())
-    assert Config.load(path).seed == values["seed"] == 3
-    assert values["versions"]["jax"]
-
-
 def test_learning_rates_fall_linearly_to_the_share_that_is_left():
     def at(env_steps, share):
         config = Config(**{**SMALL, "steps": 200, "lr_final_share": share})
