@@ -254,6 +254,7 @@ def check(
             f"--steps={config.steps}: with --updates_per_step={rate} that is 2^31 updates or more, which an "
             "int32 does not count; give fewer"
         )
+    _check_rates(config, given)
     run_of(config).refuse(given)
     config = run_of(config).in_force()
     if not mode.rl and "rl" not in given:  # given, it is looked at where its row and defaults are known
@@ -287,6 +288,16 @@ def check_replay(config: "Config", horizon: int) -> None:
             f"--frame_stack={config.frame_stack} and the {horizon} steps ahead that "
             f"--rl={specs.split(config.rl)[0]}:n_step= or --objective looks say how much it takes"
         )
+
+
+def _check_rates(config: "Config", given: Collection[str]) -> None:
+    # Where nobody says what was given, 0 is the default like any other.
+    for name in ("lr_encoder", "lr_encoder_srl") if given is not EVERYTHING else ():
+        if name in given and not getattr(config, name):
+            raise ConfigError(
+                f"--{name}=0: 0 stands for the rate of what trains the encoder; leave it out or give a rate. "
+                "With --mode=decoupled --objective=latent_l2:weight=0 the encoder stays as it is drawn"
+            )
 
 
 def _check_terminal(config: "Config") -> None:

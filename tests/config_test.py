@@ -312,6 +312,14 @@ def test_settings_that_a_mode_ignores_are_refused(values, message):
     assert "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("field", ["lr_encoder", "lr_encoder_srl"])
+def test_a_rate_of_0_that_would_be_the_default_is_refused(field):
+    joint = Config(mode="joint", objectives=("first",))
+    with pytest.raises(ConfigError, match=f"^--{field}=0: 0 stands for the rate of what trains the encoder"):
+        checks.check(joint, given=[field])
+    assert checks.check(joint, given=["lr_rl"]) == checks.check(joint) == joint
+
+
 def test_updates_that_int32_does_not_count_are_refused():
     most = Config(steps=2**31 - 1, num_envs=1, updates_per_step=1.0)
     assert checks.check(most) == most

@@ -11,6 +11,7 @@ from absl import flags
 
 from srl_jax.config import INFOS, Config, difference
 from srl_jax.errors import ConfigError, saving
+from srl_jax.files import display
 from srl_jax.files.reading import parse_json, read_bytes, replace_text
 from srl_jax.needs import Unread
 
@@ -98,7 +99,8 @@ def merged(root: Path, entries: Mapping[str, Entry]) -> dict[str, Entry]:
 def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
     """{name: the run with the configuration that it will write into its config.json}; imports jax.
 
-    A flag that all runs have need not be read by each of them: those that do not read it go without.
+    A flag that all runs have need not be read by each of them: those that do not read it go without. Says
+    which runs mean the same, so that a comparison of their arms means nothing.
 
     Raises:
         ConfigError: a run's flags are not valid, or it cannot start from the runs that it names, or nothing
@@ -125,8 +127,11 @@ def resolve(runs: Sequence[Planned]) -> dict[str, Entry]:
                 run = run._replace(flags={name: x for name, x in run.flags.items() if name != flag})
             except ConfigError as error:
                 raise ConfigError(f"{run.name}: {error}") from None
-    for entry in entries.values():
+    first: dict[Config, str] = {}
+    for name, entry in entries.items():
         _check_sources(entry, entries)
+        if (other := first.setdefault(entry.config, name)) != name:
+            display.say(f"{other} and {name} have the same settings, so that both will be the same run")
     return entries
 
 

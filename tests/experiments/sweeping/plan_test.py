@@ -169,6 +169,17 @@ def test_a_flag_for_every_run_need_not_be_read_by_each():
             planned(flags, arms[0]._replace(flags=of_one))
 
 
+def test_arms_of_the_same_settings_are_told(capsys):
+    a, same, other = (
+        Arm(name, "catch/rl_only", {"lr_rl": x}) for name, x in (("a", "1"), ("same", "1.0"), ("c", "2"))
+    )
+    manifest.resolve(plan.plan([a, same, other], ["Catch"], [0, 1]))
+    assert capsys.readouterr().err.splitlines() == [
+        f"Catch/a/{seed} and Catch/same/{seed} have the same settings, so that both will be the same run"
+        for seed in ("seed0", "seed1")
+    ]
+
+
 def test_a_grid_is_an_arm_for_each_combination():
     arms = plan.grid(
         [Arm("a", "catch/joint"), Arm("b", "catch/rl_only")], ["lr_rl=1e-4, 3e-4", "rl=:n_step=1;dqn"], {}
