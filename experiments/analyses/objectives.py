@@ -28,7 +28,9 @@ from . import output
 from .populations import LEVEL, RESULTS
 
 CAMPAIGN = RESULTS / "catch_objectives"
-BASELINES = {"joint": "rl_only_256", "decoupled": "frozen_random"}
+RL_ALONE = "rl_only_256"
+"""No objective: it is shown, and not corrected for."""
+BASELINES = {"joint": RL_ALONE, "decoupled": "frozen_random"}
 """{figure: what its objectives are compared with}."""
 GAMES = ("Catch", "CatchDistractor")
 SEEDS = range(20, 25)
@@ -68,7 +70,7 @@ def of_game(game: str, members: Mapping[str, Sequence[RunData]], baseline: str) 
     curves = {arm: [collect.steps_and_returns(run) for run in runs] for arm, runs in members.items()}
     ends = collect.ends(curves)[1]
     random = data.reference_policies(game)["random"].return_mean
-    target = random + SHARE * (ends["rl_only_256"]["at_the_end"].mean() - random)
+    target = random + SHARE * (ends[RL_ALONE]["at_the_end"].mean() - random)
     rows: dict[str, dict[str, Any]] = {}
     for arm, runs in members.items():
         area = ends[arm]["area_under_curve"]
@@ -88,7 +90,7 @@ def of_game(game: str, members: Mapping[str, Sequence[RunData]], baseline: str) 
             row["difference"] = limits(statistics.contrast(areas, [1, -1]))
             row["p"] = float(statistics.welch_p(*areas))
         rows[arm] = row
-    tested = [row for row in rows.values() if "p" in row]
+    tested = [row for arm, row in rows.items() if "p" in row and arm != RL_ALONE]
     for row, p in zip(tested, statistics.holm([row["p"] for row in tested]), strict=True):
         row["significant"] = bool(p <= LEVEL)
     return rows
@@ -136,11 +138,11 @@ def _line(arm: str, row: Mapping[str, Any], cost: Mapping[str, float]) -> list[s
     def number(x: float | None, form: str) -> str:
         return "-" if x is None else format(x, form)
 
-    objective = arm.partition("_")[2]
+    objective = _title(arm)
     difference = interval(row["difference"], "+.2f") if "difference" in row else "-"
     steps = number(row["steps to target"], ",.0f")
     return [
-        objective if arm.split("_")[0] in BASELINES else arm,
+        objective,
         interval(row["area"], ".2f"),
         f"**{difference}**" if row.get("significant") else difference,
         number(row.get("p"), ".3f"),
@@ -152,20 +154,26 @@ def _line(arm: str, row: Mapping[str, Any], cost: Mapping[str, float]) -> list[s
     ]
 
 
+def _title(arm: str) -> str:
+    """The objective of an arm, or the arm itself where it has none."""
+    figure, _, objective = arm.partition("_")
+    return objective if figure in BASELINES else arm
+
+
 def draw(name: str, games: Mapping[str, Any], path: Path) -> Path:
     """Draws the differences of a figure's objectives, in the order of those on the first game."""
     first, *_ = games.values()
     order = [arm for arm in first if "difference" in first[arm]]
     order.sort(key=lambda arm: -first[arm]["difference"]["mean"])
     panels = {
-        game: {arm.partition("_")[2]: statistics.Interval(*rows[arm]["difference"].values()) for arm in order}
+        game: {_title(arm): statistics.Interval(*rows[arm]["difference"].values()) for arm in order}
         for game, rows in games.items()
     }
-    remains = [any(rows[arm]["significant"] for rows in games.values()) for arm in order]
-    looks = [("#d55e00" if it else "#0072b2", "-") for it in remains]
+    remain = {game: [bool(rows[arm].get("significant")) for arm in order] for game, rows in games.items()}
+    looks = {game: [("#d55e00" if it else "#0072b2", "-") for it in its] for game, its in remain.items()}
     title = f"{name}: area under the curve"
-    if any(remains):
-        title += " (orange: told apart after Holm's correction)"
+    if any(map(any, remain.values())):
+        title += " (orange: told apart)"
     return plots.differences(title, BASELINES[name], panels, looks, path)
 
 

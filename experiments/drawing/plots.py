@@ -224,7 +224,7 @@ def differences(
     title: str,
     baseline: str,
     panels: Mapping[str, Mapping[str, statistics.Interval]],
-    looks: Sequence[Style],
+    looks: Mapping[str, Sequence[Style]],
     path: str | os.PathLike,
 ) -> Path:
     """Draws how arms differ from the baseline: a point and an interval each, beside 0.
@@ -233,7 +233,7 @@ def differences(
         title: above it.
         baseline: its name.
         panels: what differs -> arm -> the difference; the same arms in each.
-        looks: of the arms.
+        looks: what differs -> those of the arms.
         path: of the PNG file.
     """
     arms = list(next(iter(panels.values())))
@@ -244,7 +244,7 @@ def differences(
         plain(axes)
         axes.grid(False, axis="y")
         axes.axvline(0, color="#555555", linewidth=1)
-        for i, (interval, (colour, _)) in enumerate(zip(found.values(), looks, strict=True)):
+        for i, (interval, (colour, _)) in enumerate(zip(found.values(), looks[name], strict=True)):
             axes.plot([interval.low, interval.high], [i, i], color=colour, linewidth=2.2)
             axes.plot([interval.point], [i], "o", color=colour, markersize=5)
         axes.set_yticks(range(len(arms)), arms, fontsize=8, parse_math=False)

@@ -167,7 +167,9 @@ def differences(game: str, tables: Sequence[Mapping[str, Any]], looks: Looks, ba
     if all(np.isnan(interval.low) for interval in arms.values()):
         return []
     styles = [looks[arm] for arm in arms]
-    picture = pictures.drawn(lambda path: plots.differences(game, baseline, panels, styles, path))
+    picture = pictures.drawn(
+        lambda path: plots.differences(game, baseline, panels, dict.fromkeys(panels, styles), path)
+    )
     return [Shown(picture, f"{game}: differences from {baseline}")]
 
 
