@@ -4,6 +4,7 @@ Prints one JSON object: the game, the checkpoint's env steps, the mean, and ever
 --final these are the run's own final games, whose returns are those of its row of kind "final".
 """
 
+import dataclasses
 import functools
 import json
 from collections.abc import Callable
@@ -43,7 +44,7 @@ def check_final(manifest: Manifest, values: flags.FlagValues) -> None:
         return
     if not manifest.config.final_games:
         raise ConfigError(f"--final: the run in {values.run} has no final games; give --games=100, say")
-    for name in ("games", "envs", "seed", "epsilon"):
+    for name in ("games", "envs", "seed", "epsilon", "max_steps"):
         if values[name].present:
             raise ConfigError(f"--{name}={values[name].value}: given beside --final, which has the run's own")
     rows = read_rows(manifest.path.parents[1] / "metrics.jsonl")
@@ -85,6 +86,8 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
     from srl_jax.run import actor, evaluations
     from srl_jax.run.evaluate import evaluate
 
+    most = values.max_steps or config.eval_max_steps
+    config = dataclasses.replace(config, eval_max_steps=most)
     loaded = loading.load(values.run, imports=values["import"].value)
     manifest, seed = loaded.manifest, values.seed
     games, at_once = values.games, values.envs or config.eval_envs or config.num_envs
@@ -107,8 +110,8 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
         seed=seed,
         epsilon=config.eps_eval if values.epsilon is None else values.epsilon,
         stack=config.frame_stack,
-        max_steps=config.eval_max_steps,
-        record=config.eval_max_steps + 1 if values.gif else 0,
+        max_steps=most,
+        record=most + 1 if values.gif else 0,
     )
     result = {
         "game": config.game,
@@ -117,6 +120,8 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
         "returns": played.returns,
         "lengths": played.lengths,
     }
+    if cut := sum(length >= most for length in played.lengths):
+        display.say(f"{cut} of the games were cut at {most} env steps; --max_steps= sets where")
     display.result(json.dumps(result))
     if values.gif:
         from .drawing import images
@@ -128,8 +133,10 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
 def define_flags(values: flags.FlagValues) -> None:
     """Defines this entry point's flags."""
     flags.DEFINE_string("run", "", "run directory, or one of its checkpoints", values)
-    games = Info(int, "full games to play", minimum=1, maximum=1_000_000)
+    games = Info(int, "games to play", minimum=1, maximum=1_000_000)
     config_flags.define("games", games, 10, values)
+    most = Info(int, "where a game is cut; 0: at the run's eval_max_steps", "env steps", minimum=0)
+    config_flags.define("max_steps", most, 0, values)
     envs = Info(int, "environments that play at once; 0: the run's eval_envs", "environments", minimum=0)
     config_flags.define("envs", envs, 0, values)
     flags.DEFINE_boolean("final", False, "play the run's own final games, again", values)

@@ -117,6 +117,12 @@ class Loaded:
                 f"observations must be uint8, or float32 in [0, 1], [..., {wanted}], not "
                 f"{observations.dtype} {given}"
             )
+        if isinstance(observations, np.ndarray) and observations.dtype == np.float32 and observations.size:
+            low, high = observations.min(), observations.max()
+            if not 0 <= low <= high <= 1:
+                raise ValueError(
+                    f"observations of float32 must be in [0, 1], not [{low:g}, {high:g}]; give bytes as uint8"
+                )
         ahead = observations.shape[:-3]
         if 0 in ahead:
             one = jax.eval_shape(function, jax.ShapeDtypeStruct((1, *shape), observations.dtype))

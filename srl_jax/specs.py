@@ -372,7 +372,8 @@ def option_defaults(factory: Callable) -> dict[str, Any]:
     for parameter in inspect.signature(factory).parameters.values():
         if parameter.kind is inspect.Parameter.KEYWORD_ONLY:
             if type(parameter.default) not in KINDS:
-                raise TypeError(f"{factory}: {parameter.name} needs a bool, int, float or str default")
+                name = getattr(factory, "__name__", factory)
+                raise TypeError(f"{name}: {parameter.name} needs a bool, int, float or str default")
             defaults[parameter.name] = parameter.default
     return defaults
 

@@ -219,12 +219,13 @@ def sentence(error: ConfigError) -> str:
 
 
 def not_finite(run: Path) -> list[str]:
-    """The numbers of a run's rows that are none."""
+    """A run's numbers that are none, but for means of no games and the direction of no gradient."""
     found = []
     for row in rows_of(run):
         for name, x in row.items():
             of_games = "return" in name or "length" in name  # none may have ended
-            if x is None and not of_games or isinstance(x, float) and not np.isfinite(x):
+            no_gradient = name.endswith("/cosine") and row.get(name.replace("cosine", "norm_ratio")) == 0
+            if (x is None and not (of_games or no_gradient)) or (isinstance(x, float) and not np.isfinite(x)):
                 found.append(f"{name} at {row['env_steps']}")
     return found
 

@@ -80,6 +80,11 @@ def test_other_observations_are_refused(loaded, wrong, given):
         loaded.encode(wrong)
 
 
+def test_floats_that_are_bytes_are_refused(loaded):
+    with pytest.raises(ValueError, match=r"must be in \[0, 1\], not \[0, 255\]; give bytes as uint8$"):
+        loaded.encode(observations(2).astype(np.float32))
+
+
 def test_epsilon_is_the_share_of_random_actions(loaded):
     x = np.broadcast_to(observations(1), (900, 42, 42, 4))
     greedy = loaded.act(x)

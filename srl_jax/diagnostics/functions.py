@@ -79,7 +79,7 @@ def make_conflict(
     The cosine of an objective's gradient on the encoder's parameters with RL's, and its norm over RL's norm,
     both gradients of `weight * mean(losses)`, with the weight that a ratio is at that moment. Every
     loss's gradient enters the encoder here, whatever the mode: in mode decoupled it is the gradient that RL's
-    would be.
+    would be. The cosine is NaN where a gradient is 0, as that of an objective of weight 0.
     """
     gradient = make_encoder_gradient(encoder, objectives, mode, views=views)
 

@@ -54,6 +54,10 @@ class Result(NamedTuple):
     pictures: dict[str, tuple]
     recording: np.ndarray | None
 
+    def __repr__(self) -> str:
+        """Without its pictures."""
+        return f"Result({', '.join(f'{name}={getattr(self, name)}' for name in self._fields[:4])})"
+
 
 def train(config: Config, out: str | Path, *, resume: Manifest | None = None, **options: Any) -> Result:
     """Trains one agent, of the configuration's seed; otherwise as `train_seeds`."""

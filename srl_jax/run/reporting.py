@@ -30,22 +30,27 @@ class Means:
 
     def __init__(self):
         self._sums: dict[str, tuple[float, int]] = {}
+        self._broken: list[str] = []
 
     def add(self, metrics: Mapping[str, Any]) -> None:
         """Takes an update's metrics, scalars on the host."""
+        # After the first update with one that is not finite no loss is: its parameters are not, either.
+        self._broken = self._broken or [
+            name for name, x in metrics.items() if name.startswith("loss/") and not np.isfinite(x)
+        ]
         for name, x in metrics.items():
             if not (name.startswith(SOMETIMES) and x < 0):
                 total, count = self._sums.get(name, (0.0, 0))
                 self._sums[name] = total + float(x), count + 1
 
     def broken(self) -> str | None:
-        """The name of a loss that was NaN or infinite since the last row, or None."""
-        names = sorted(self._sums, key=lambda name: name == "loss/total")
-        return next((n for n in names if n.startswith("loss/") and not np.isfinite(self._sums[n][0])), None)
+        """The losses that were NaN or infinite in the first update, since the last row, with one; or None."""
+        parts = [name for name in self._broken if name != "loss/total"]
+        return ", ".join(sorted(parts or self._broken)) or None
 
     def take(self) -> dict[str, np.float32]:
         """The means, and starts anew."""
-        sums, self._sums = self._sums, {}
+        sums, self._sums, self._broken = self._sums, {}, []
         return {name: np.float32(total / count) for name, (total, count) in sums.items()}
 
     def snapshot(self) -> dict[str, list]:

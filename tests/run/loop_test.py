@@ -228,7 +228,16 @@ def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypa
     config_flags.parse(["evaluate", f"--run={joint[0]}", "--games=1"], values)
     evaluate.main(values)
     assert asked == [(("eval", 1), {"seed": 0})]
-    assert len(json.loads(capsys.readouterr().out)["returns"]) == 1
+    written = capsys.readouterr()
+    assert len(json.loads(written.out)["returns"]) == 1 and "cut" not in written.err
+
+    values = flags.FlagValues()
+    evaluate.define_flags(values)
+    config_flags.parse(["evaluate", f"--run={joint[0]}", "--games=2", "--max_steps=3"], values)
+    evaluate.main(values)
+    written = capsys.readouterr()
+    assert json.loads(written.out)["lengths"] == [3, 3]
+    assert "2 of the games were cut at 3 env steps" in written.err
 
 
 def test_a_checkpoint_that_asks_for_what_there_is_not_is_refused_by_its_name(joint, tmp_path):

@@ -79,11 +79,15 @@ def test_a_loss_that_is_not_finite_is_named(bad, at):
             losses |= {"loss/a": bad, "loss/total": bad}
         means.add({name: np.float32(x) for name, x in losses.items()})
     assert means.broken() == "loss/a"  # the part, not the total that it is in
-    means.add({"loss/a": np.float32(-np.inf)})  # inf - inf
+    # Its gradient has made all parameters NaN.
+    means.add({name: np.float32(np.nan) for name in ("loss/total", "loss/a", "loss/b")})
     assert means.broken() == "loss/a"
     means.take()
     means.add({"loss/total": np.float32(bad)})
     assert means.broken() == "loss/total"
+    means.take()
+    means.add({name: np.float32(bad) for name in ("loss/b", "loss/total", "loss/a")})
+    assert means.broken() == "loss/a, loss/b"
 
 
 def test_snapshots_of_means_are_exact():
