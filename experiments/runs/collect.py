@@ -33,6 +33,8 @@ PROTOCOL = (
 
 WRITTEN = ("loggers", "checkpoint_every", "keep_encoder_every", "keep_best", "keep_replay")
 """Fields that say what is written of a run beside its rows."""
+FIVE_MINUTES = 4_500
+"""Env steps of an Atari game, the least at which a published protocol cuts one (Bellemare et al. 2013)."""
 OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", *WRITTEN)
 """Fields in which runs of one arm and game may differ: what is theirs alone, and what is `WRITTEN`."""
 
@@ -410,6 +412,8 @@ def differs(
             unknown = ["kind of score"]
         elif score.score_of != "evaluation":
             more = [f"{score.score_of} score (here the mean of {config.eval_games} evaluation games)"]
+        if config.eval_max_steps < FIVE_MINUTES:
+            more += [f"whole games (here cut at {config.eval_max_steps:,} env steps)"]
     texts = [
         f"{name} {there:,} (here {here:,})"
         for name, (there, here) in compared.items()

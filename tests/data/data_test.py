@@ -71,6 +71,7 @@ def test_what_differs_is_said_in_a_line():
         "training score (here the mean of 10 evaluation games)"
     )
     assert "env steps 1,000,000 (here 50,000)" in differs(rainbow, PONG, env_steps=50_000)
+    assert "whole games (here cut at 300 env steps)" in differs(rainbow, replace(PONG, eval_max_steps=300))
     same = Published("Pong", "x", 1_000_000, 0.0, None, 3, "evaluation", 0.25, 0.005, "", "")
     assert differs(same, replace(PONG, sticky_actions=0.25), seeds=3) == ""
     unknown = same._replace(seeds=None, score_of=None, sticky_actions=None)
