@@ -37,8 +37,6 @@ FIVE_MINUTES = 4_500
 """Env steps of an Atari game, the least at which a published protocol cuts one (Bellemare et al. 2013)."""
 OF_A_SEED = ("seed", "encoder_from", "policy_from", "imports", *WRITTEN)
 """Fields in which runs of one arm and game may differ: what is theirs alone, and what is `WRITTEN`."""
-
-
 OF_AN_ARM = tuple(name for name in INFOS if name not in OF_A_SEED)
 """The other fields, in which they do not differ."""
 

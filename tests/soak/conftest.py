@@ -181,7 +181,7 @@ def pytest_terminal_summary(terminalreporter, config):
             for what, value in row["counts"].items()
         ]
         part, title = module.removesuffix("_test"), name.removeprefix("test_").replace("_", " ")
-        cells = part, title, len(row["outcomes"]), bad, "; ".join(counts), f"{row['seconds'] / 60:.1f}"
+        cells = part, title, len(row["outcomes"]), bad, "<br>".join(counts), f"{row['seconds'] / 60:.1f}"
         lines.append(f"| {' | '.join(str(cell).replace('|', '/') for cell in cells)} |")
     about = {"revision": git_revision(), "python": platform.python_version(), "machine": platform.machine()}
     changed = {name: config.getoption(name) for name, (number, _) in AMOUNTS.items()}
