@@ -254,19 +254,25 @@ MEMORY = Group(
 GROUPS = (UPDATE, UPDATES_OF_256, OF_DER, LOOP, REPLAY, STARTUP, MEMORY)
 """The table, in order."""
 
-OBJECTIVES = (
+NAMES = (
     "reconstruction forward_pixels vae forward_latent spr byol vicreg barlow infonce slowness inverse reward "
     "terminal bisimulation latent_l2"
 ).split()
+OBJECTIVES = dict(zip(NAMES, NAMES, strict=True)) | {
+    "reconstruction_moving": "reconstruction:moving=10",
+    "forward_latent_5": "forward_latent:steps=5",
+    "infonce_temporal": "infonce:temporal=3",
+}
+"""{name: specification}; the last ones are arms of results/catch_objectives."""
 
 
-def _objective(name: str) -> Group:
+def _objective(name: str, text: str) -> Group:
     """What an objective adds to an update of RL alone, at the size of Catch, one Adam on the sum."""
-    beside = _ours(SMALL, 60, mode="joint", objectives=(name,), encoder_optimizer="summed")
+    beside = _ours(SMALL, 60, mode="joint", objectives=(text,), encoder_optimizer="summed")
     alone = f"alone beside {name}"  # a name of its own: both take turns
     row = _cost(f"RL and {name} / RL", name, alone, "RL alone")
     return Group({alone: _ours(SMALL, 60), name: beside}, {f"objective_{name}": row})
 
 
-OF_OBJECTIVES = tuple(_objective(name) for name in OBJECTIVES)
+OF_OBJECTIVES = tuple(_objective(*item) for item in OBJECTIVES.items())
 """Another table, `--only=objectives`."""

@@ -211,7 +211,11 @@ def test_rows_are_chosen_in_the_tables_order():
     assert bench.chosen_rows(None) == bench.MAIN
     assert bench.chosen_rows(["memory", "loop"]) == ["loop", "memory"]
     ours = [name for name, row in objectives.REGISTRY.items() if row.__module__.startswith("srl_jax.")]
-    assert bench.chosen_rows(["objectives", "loop"]) == ["loop", *(f"objective_{name}" for name in ours)]
+    others = ["reconstruction_moving", "forward_latent_5", "infonce_temporal"]
+    assert bench.chosen_rows(["objectives", "loop"]) == [
+        "loop",
+        *(f"objective_{name}" for name in ours + others),
+    ]
 
 
 @pytest.mark.parametrize(

@@ -144,7 +144,9 @@ def test_the_costs_of_objectives_are_those_that_were_measured():
             for names, costs in table
             for pair in zip(re.findall(r"\w+", names), costs.split(", "), strict=True)
         ]
-        assert len(told) == len(measured) and dict(told) == measured, page
+        ours = {name for name, row in objectives.REGISTRY.items() if row.__module__.startswith("srl_jax.")}
+        assert dict(told) == {name: cost for name, cost in measured.items() if name in ours}, page
+        assert len(told) == len(ours)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
