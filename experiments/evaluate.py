@@ -120,7 +120,7 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
         "returns": played.returns,
         "lengths": played.lengths,
     }
-    if cut := sum(length >= most for length in played.lengths):
+    if cut := played.cut(most):
         display.say(f"{cut} of the games were cut at {most} env steps; --max_steps= sets where")
     display.result(json.dumps(result))
     if values.gif:

@@ -153,9 +153,10 @@ def convolutional_encoder(
     layers = tuple(layers)
     same = padding == "same"
     sizes = tuple(zip(*(layer_sides(side, layers, same, least_seen) for side in sides), strict=True))
-    pads = tuple(map(padding_between, sizes, sizes[1:], layers))
     if same:
         pads = tuple(padding_of("SAME", x, y.kernel, y.stride) for x, y in zip(sizes, layers, strict=False))
+    else:
+        pads = tuple(map(padding_between, sizes, sizes[1:], layers))
     latent = end.latent((*sizes[-1], layers[-1].channels), features, own_end)
     network = EncoderNetwork(layers, start, pads, latent, activation, lix)
     decoder = DecoderNetwork(layers, start, pads, latent, sizes[:-1], channels, sigmoid, activation)

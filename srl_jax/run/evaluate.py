@@ -24,6 +24,10 @@ class Evaluation(NamedTuple):
     lengths: list[int]
     frames: np.ndarray
 
+    def cut(self, max_steps: int) -> int:
+        """How many games were cut after so many env steps."""
+        return sum(length >= max_steps for length in self.lengths)
+
 
 def evaluate(
     policy: Policy,

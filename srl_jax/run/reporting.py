@@ -180,7 +180,7 @@ class Report:
         what = "final evaluation" if kind == "final" else "evaluation"
         took = f"{games} games, {seconds:.1f} s"
         most = self._config.eval_max_steps
-        if cut := sum(length >= most for length in played.lengths):
+        if cut := played.cut(most):
             took += f", {cut} of them cut at {most} env steps"
         self.progress.note(f"{what} after {env_steps} env steps: mean return {mean:.2f} over {took}")
         return mean
