@@ -35,6 +35,7 @@ from ..arms import SCORES
 from ..command_line import flags as config_flags
 from ..runs import collect
 from ..runs.run_data import RunData
+from .criteria import CRITERIA, WRITTEN
 from .populations import LEVEL, RESULTS
 
 ROOT = RESULTS.parents[1]
@@ -198,6 +199,14 @@ def commands(results: Path = RESULTS) -> Iterator[tuple[str, list[str]]]:
         )  # fmt: skip
     for module, folder in ANALYSES.items():
         yield folder, ["-m", f"experiments.analyses.{module}", f"--out={results / folder}"]
+    for folder in with_criteria(results):
+        given = [f"--campaign={folder}", f"--out={folder}"]
+        yield f"criteria of {folder.name}", ["-m", "experiments.analyses.criteria", *given]
+
+
+def with_criteria(results: Path = RESULTS) -> list[Path]:
+    """The packed campaigns that have their criteria as data."""
+    return [path.parent for path in sorted(results.glob(f"*/{CRITERIA}")) if packing.is_packed(path.parent)]
 
 
 def contents(results: Path = RESULTS) -> dict[Path, bytes]:
@@ -209,6 +218,9 @@ def contents(results: Path = RESULTS) -> dict[Path, bytes]:
         for folder in ANALYSES.values()
         for path in (results / folder).iterdir()
         if path.name != "README.md"
+    ]
+    paths += [
+        folder / name for folder in with_criteria(results) for name in WRITTEN if (folder / name).exists()
     ]
     return {path: path.read_bytes() for path in [PAGE, README, *paths]}
 

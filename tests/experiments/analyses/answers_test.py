@@ -88,4 +88,5 @@ def test_every_figure_of_a_packed_campaign_is_drawn_again():
         "--seeds=10,11,12,13,14,15,16,17,18,19,",
     ]
     assert len(answers.contents()) > 40
-    assert set(answers.ANALYSES.values()) == set(found) - drawn
+    asked = {f"criteria of {folder.name}" for folder in answers.with_criteria()}
+    assert {*answers.ANALYSES.values(), *asked} == set(found) - drawn

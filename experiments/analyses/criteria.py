@@ -1,0 +1,239 @@
+"""The tests that a campaign's criteria.json asks for: `python -m experiments.analyses.criteria`.
+
+A campaign (--campaign) writes down before its runs what will decide, as data:
+
+    game       of the runs
+    measures   what is tested of each run, of `MEASURES`
+    families   {family: {test: {arm: weight}}}: weighted sums of the means of arms, each with a two-sided
+               t test of 0 (`srl_jax.statistics.contrast`); Holm's correction is over a family, for each
+               measure on its own. An arm less its baseline has weights 1 and -1.
+    doses      optional: {"across": what varies, "reference": an arm, "panels": {panel: {line: {dose: arm}}}},
+               drawn over the logarithm of the dose; of each line it is said how often which dose is best,
+               when the runs of each arm are drawn again with replacement
+
+`--out` writes DIRECTORY/tests.json and .md, and doses.png where there are doses. Imports no jax.
+"""
+
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from absl import flags
+
+from srl_jax import statistics
+from srl_jax.diagnostics.drift import STEPS
+from srl_jax.errors import ConfigError
+from srl_jax.files import display
+from srl_jax.files.reading import read_json
+
+from .. import packing
+from ..command_line import flags as config_flags
+from ..drawing import plots
+from ..runs import collect
+from ..runs.json_values import limits, plain
+from ..runs.run_data import RunData
+from . import output
+from .populations import LEVEL
+
+CRITERIA = "criteria.json"
+WRITTEN = "tests.json", "tests.md", "doses.png"
+REPETITIONS = 10_000
+
+Arms = Mapping[str, Sequence[RunData]]
+
+
+def areas(arms: Arms) -> dict[str, np.ndarray]:
+    """{arm: area under the learning curve of each run}."""
+    curves = {arm: [collect.steps_and_returns(run) for run in runs] for arm, runs in arms.items()}
+    return {arm: ends["area_under_curve"] for arm, ends in collect.ends(curves)[1].items()}
+
+
+def drifts(arms: Arms) -> dict[str, np.ndarray]:
+    """{arm: 1 less the cosine of latents with those of the encoder kept last before, mean over a run's rows}.
+
+    The first row that has one is left out: it compares with the encoder from before any update.
+    """
+    return {arm: np.array([_drift(run) for run in runs]) for arm, runs in arms.items()}
+
+
+def _drift(run: RunData) -> float:
+    cosines = [row["diag/drift/cosine"][-1] for row in run.rows if row.get(STEPS)]
+    if len(cosines) < 2:
+        raise ConfigError(f"{run.path}: has no drift, which --diagnostics gives")
+    return 1.0 - float(np.mean(cosines[1:]))
+
+
+MEASURES: dict[str, Callable[[Arms], dict[str, np.ndarray]]] = {"area": areas, "drift": drifts}
+
+
+def analyse(campaign: Path) -> dict[str, Any]:
+    """The tests of a campaign, as JSON values.
+
+    Returns:
+        {"arms": {measure: {arm: its mean and interval}}, "tests": {measure: {family: {test: the weighted
+        sum, its interval, "p", "holm": p after the correction}}}, "best": {panel: {line: {dose: share}}}}.
+
+    Raises:
+        ConfigError: the criteria are none, or a run is not there, is not over, or cannot be compared.
+    """
+    asked = read(campaign)
+    arms = runs_of(campaign, asked)
+    found: dict[str, Any] = {"arms": {}, "tests": {}}
+    for measure in asked["measures"]:
+        values = MEASURES[measure](arms)
+        found["arms"][measure] = {arm: limits(statistics.mean_interval(x)) for arm, x in values.items()}
+        found["tests"][measure] = {
+            family: tested(tests, values) for family, tests in asked["families"].items()
+        }
+    if doses := asked.get("doses"):
+        values = areas(arms)
+        found["best"] = {
+            panel: {line: best(its, values) for line, its in lines.items()}
+            for panel, lines in doses["panels"].items()
+        }
+    return found
+
+
+def read(campaign: Path) -> dict[str, Any]:
+    """A campaign's criteria.
+
+    Raises:
+        ConfigError: they are none.
+    """
+    path = campaign / CRITERIA
+    asked = read_json(path)
+    try:
+        unknown = set(asked["measures"]) - MEASURES.keys()
+        tests = [weights for family in asked["families"].values() for weights in family.values()]
+        for weights in tests:
+            np.array([weights[arm] for arm in weights], np.float64)
+        if unknown or not tests or not isinstance(asked["game"], str):
+            raise ValueError
+        if doses := asked.get("doses"):
+            lines = [its for of_panel in doses["panels"].values() for its in of_panel.values()]
+            doses["across"], doses["reference"]
+            if not all(float(dose) > 0 for its in lines for dose in its):
+                raise ValueError
+    except (TypeError, KeyError, ValueError, AttributeError):
+        wanted = (
+            f'"game", "measures" out of {", ".join(MEASURES)}, "families" of tests {{arm: weight}}, and '
+            f'perhaps "doses" above 0, see experiments/analyses/criteria.py'
+        )
+        raise ConfigError(f"{path}: expected {wanted}") from None
+    return asked
+
+
+def runs_of(campaign: Path, asked: Mapping[str, Any]) -> dict[str, list[RunData]]:
+    """The runs of each arm that the criteria name."""
+    there = collect.grouped(packing.read(campaign)).get(asked["game"], {})
+    named = [arm for family in asked["families"].values() for weights in family.values() for arm in weights]
+    if doses := asked.get("doses"):
+        named += [arm for lines in doses["panels"].values() for its in lines.values() for arm in its.values()]
+        named.append(doses["reference"])
+    arms = {arm: there.get(arm, []) for arm in dict.fromkeys(named)}
+    for arm, runs in arms.items():
+        if len(runs) < 2 or not all(run.over and not run.failed for run in runs):
+            raise ConfigError(f"{campaign}: {arm} on {asked['game']} has not two runs or more that are over")
+    every = [run for runs in arms.values() for run in runs]
+    collect.check_arms(every)
+    collect.check_protocols(every)
+    return arms
+
+
+def tested(
+    tests: Mapping[str, Mapping[str, float]], values: Mapping[str, np.ndarray]
+) -> dict[str, dict[str, Any]]:
+    """The tests of a family on one measure."""
+    found = {}
+    for name, weights in tests.items():
+        groups = [values[arm] for arm in weights], list(weights.values())
+        found[name] = limits(statistics.contrast(*groups)) | {"p": plain(statistics.contrast_p(*groups))}
+    ps = [np.nan if row["p"] is None else row["p"] for row in found.values()]
+    for row, p in zip(found.values(), statistics.holm(ps), strict=True):
+        row["holm"] = plain(p)
+    return found
+
+
+def best(doses: Mapping[str, str], values: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """{dose: how often its arm has the highest mean}, of `REPETITIONS` in which runs are drawn again."""
+    rng = np.random.default_rng(0)
+    means = [
+        x[rng.integers(len(x), size=(REPETITIONS, len(x)))].mean(-1)
+        for x in (values[arm] for arm in doses.values())
+    ]
+    counts = np.bincount(np.argmax(means, 0), minlength=len(doses))
+    return {dose: float(count / REPETITIONS) for dose, count in zip(doses, counts, strict=True)}
+
+
+def tables(found: Mapping[str, Any]) -> str:
+    """The tests as tables in Markdown; bold is what is told from 0 after Holm's correction."""
+    parts = []
+    for measure, families in found["tests"].items():
+        for family, tests in families.items():
+            body = [
+                [name, _interval(row, "+.3f", bold=row["holm"] is not None and row["holm"] <= LEVEL)]
+                + ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("p", "holm")]
+                for name, row in tests.items()
+            ]
+            title = f"**{family}** ({measure})"
+            parts.append(f"{title}\n\n{output.markdown(['test', 'found', 'p', 'after Holm'], body)}")
+        arms = [[arm, _interval(row, ".3f")] for arm, row in found["arms"][measure].items()]
+        parts.append(f"**Arms** ({measure})\n\n{output.markdown(['arm', 'mean'], arms)}")
+    for panel, lines in found.get("best", {}).items():
+        head = ["best of", *next(iter(lines.values()))]
+        body = [
+            [line, *(f"{share:.0%}".replace("%", " %") for share in its.values())]
+            for line, its in lines.items()
+        ]
+        parts.append(f"**How often which dose is best, {panel}**\n\n{output.markdown(head, body)}")
+    return "\n\n".join(parts)
+
+
+def _interval(row: Mapping[str, Any], form: str, bold: bool = False) -> str:
+    low, high = ("-" if row[key] is None else format(row[key], form) for key in ("low", "high"))
+    text = f"{row['mean']:{form}} [{low}, {high}]"
+    return f"**{text}**" if bold else text
+
+
+def draw(campaign: Path, path: Path) -> Path:
+    """Draws the mean area of each dose, with the reference as a horizontal line."""
+    asked = read(campaign)
+    doses, values = asked["doses"], areas(runs_of(campaign, asked))
+    reference = doses["reference"]
+    panels = []
+    for title, lines in doses["panels"].items():
+        drawn = []
+        for name, its in lines.items():
+            found = [statistics.mean_interval(values[arm]) for arm in its.values()]
+            at = [float(np.log10(float(dose))) for dose in its]
+            curve = plots.Curve(at, *zip(*((x.point, x.low, x.high) for x in found), strict=True))
+            drawn.append(plots.Line(name, curve, min(len(values[arm]) for arm in its.values())))
+        level = plots.Level(reference, float(values[reference].mean()))
+        across = f"{doses['across']} (powers of ten)"
+        panels.append(plots.Panel("", drawn, [level], title=title, across=across))
+    return plots.draw_panels(panels, path, "", label="area under the learning curve")
+
+
+def define_flags(values: flags.FlagValues) -> None:
+    """Defines this entry point's flags."""
+    flags.DEFINE_string("campaign", "", f"packed campaign with a {CRITERIA}", values)
+    output.define_out("tests.json and .md, and doses.png where doses are asked for", values)
+
+
+def main(values: flags.FlagValues) -> None:
+    """The entry point."""
+    campaign = Path(values.campaign)
+    asked = read(campaign)
+    out = output.place(values.out, drawn="doses" in asked)
+    found = analyse(campaign)
+    display.result(tables(found))
+    if out is not None:
+        output.write(out, {"tests.json": json.dumps(found, indent=1), "tests.md": tables(found)})
+        if "doses" in asked:
+            draw(campaign, out / "doses.png")
+
+
+if __name__ == "__main__":
+    config_flags.program(main, define_flags)()
