@@ -1,4 +1,4 @@
-"""srl_jax/layers.py against plain jax, and numbers worked by hand."""
+"""srl_jax.layers against plain jax, and numbers worked by hand."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ import pytest
 from flax.errors import ScopeParamShapeError
 
 from srl_jax import layers
-from srl_jax.layers import Conv, ConvTranspose, Dense, NoisyDense, WideDense
+from srl_jax.layers import Conv, ConvTranspose, Dense, NoisyDense, WideDense, dense, initialisers
 
 
 def transposed(x, kernel, bias, stride, size):
@@ -208,7 +208,7 @@ def test_conv_transpose_refuses_sizes_that_its_mirror_could_not_have_seen(size):
 
 
 def test_initialisation_is_uniform_within_one_over_the_root_of_fan_in():
-    x = np.asarray(layers.uniform_fan_in(25)(jax.random.key(0), (100, 100)))
+    x = np.asarray(initialisers.uniform_fan_in(25)(jax.random.key(0), (100, 100)))
     assert np.abs(x).max() <= 0.2
     assert np.abs(x).max() > 0.199
     # A uniform distribution on [-b, b] has mean 0 and standard deviation b / sqrt(3).
@@ -218,14 +218,14 @@ def test_initialisation_is_uniform_within_one_over_the_root_of_fan_in():
 
 def test_he_normal_keeps_the_size_of_a_signal():
     # Variance 2 / 50 = 0.2 ** 2; truncated at two deviations of the normal that is cut: 2 * 0.2 / 0.8796.
-    x = np.asarray(layers.he_normal(50)(jax.random.key(0), (100, 100)))
+    x = np.asarray(initialisers.he_normal(50)(jax.random.key(0), (100, 100)))
     np.testing.assert_allclose(x.std(), 0.2, rtol=0.02)
     assert abs(x.mean()) < 0.01 and 0.45 < np.abs(x).max() <= 0.4548
 
 
 def test_xavier_uniform_is_flaxs():
     # 3 * 3 * 4 = 36 inputs and 3 * 3 * 20 = 180 outputs: b = sqrt(6 / 216) = 1/6.
-    x = np.asarray(layers.xavier_uniform(36)(jax.random.key(0), (3, 3, 4, 20)))
+    x = np.asarray(initialisers.xavier_uniform(36)(jax.random.key(0), (3, 3, 4, 20)))
     assert 0.16 < np.abs(x).max() <= 1 / 6
     assert x.std() == pytest.approx(1 / 6 / np.sqrt(3), rel=0.1)
     flaxs = jax.nn.initializers.xavier_uniform()(jax.random.key(0), (3, 3, 4, 20), np.float32)
@@ -235,19 +235,19 @@ def test_xavier_uniform_is_flaxs():
 @pytest.mark.parametrize("shape", [(3, 3, 4, 20), (2, 2, 3, 30)])  # more rows than columns, and fewer
 def test_orthogonal_kernels_are_orthogonal(shape):
     inputs, outputs = int(np.prod(shape[:-1])), shape[-1]
-    x = np.asarray(layers.orthogonal(inputs)(jax.random.key(0), shape)).reshape(inputs, outputs)
+    x = np.asarray(initialisers.orthogonal(inputs)(jax.random.key(0), shape)).reshape(inputs, outputs)
     product = x.T @ x if inputs > outputs else x @ x.T
     np.testing.assert_allclose(product, 2 * np.eye(min(inputs, outputs)), atol=1e-5)
     # Where a quarter of the inputs reaches an output, as through strides of 2, a signal keeps its size, too.
-    y = np.asarray(layers.orthogonal(inputs / 4)(jax.random.key(0), shape)).reshape(inputs, outputs)
+    y = np.asarray(initialisers.orthogonal(inputs / 4)(jax.random.key(0), shape)).reshape(inputs, outputs)
     np.testing.assert_allclose(y, 2 * x, rtol=1e-5, atol=1e-7)
 
 
 def test_every_layer_knows_its_fan_in(monkeypatch):
     fans = []
-    record = lambda n: fans.append(n) or layers.zeros  # noqa: E731
-    monkeypatch.setattr(layers, "uniform_fan_in", record)
-    monkeypatch.setitem(layers.INITIALISERS, "pytorch", lambda n: (record(n), layers.zeros))
+    record = lambda n: fans.append(n) or initialisers.zeros  # noqa: E731
+    monkeypatch.setattr(dense, "uniform_fan_in", record)
+    monkeypatch.setitem(layers.INITIALISERS, "pytorch", lambda n: (record(n), initialisers.zeros))
     cases = [
         (Dense(7), (1, 25), 25),
         (WideDense(7), (1, 25), 25),
@@ -300,7 +300,7 @@ def test_zero_sum_takes_each_windows_mean():
         return jnp.arange(8.0, dtype=dtype).reshape(shape)
 
     # Values 0..7 in order [2, 2, 2, 1]: channel 0 has 0, 2, 4, 6 (mean 3), channel 1 has 1, 3, 5, 7 (mean 4).
-    kernel = layers.zero_sum(init)(None, (2, 2, 2, 1))
+    kernel = initialisers.zero_sum(init)(None, (2, 2, 2, 1))
     np.testing.assert_array_equal(kernel.reshape(4, 2), [[-3, -3], [-1, -1], [1, 1], [3, 3]])
 
 
@@ -323,7 +323,7 @@ def test_noisy_dense_by_hand():
 def test_noisy_dense_is_the_same_for_few_and_for_many_rows():
     # Two forms of one sum: few rows are multiplied by mu and by sigma, many by their noisy sum.
     rng = np.random.default_rng(0)
-    few, many = (rng.normal(size=(n, 30)).astype(np.float32) for n in (layers.FEW_ROWS, layers.FEW_ROWS + 1))
+    few, many = (rng.normal(size=(n, 30)).astype(np.float32) for n in (dense.FEW_ROWS, dense.FEW_ROWS + 1))
     many[:-1] = few
     f = rng.normal(size=50).astype(np.float32)
     layer = NoisyDense(20, 2.0)
@@ -376,7 +376,7 @@ def test_a_layer_is_applied_without_its_initialiser_and_refuses_weights_of_anoth
     def initialiser(fan_in):
         return lambda *_: pytest.fail("the initialiser is traced though there are weights")
 
-    monkeypatch.setattr(layers, "uniform_fan_in", initialiser)
+    monkeypatch.setattr(initialisers, "uniform_fan_in", initialiser)
     expected = np.ones((1, 3)) @ params["kernel"] + params["bias"]
     np.testing.assert_allclose(apply(params, jnp.ones((1, 3))), expected, rtol=1e-6)
     with pytest.raises(ScopeParamShapeError, match="kernel"):
