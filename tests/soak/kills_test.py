@@ -1,7 +1,7 @@
 """Runs that are killed with SIGKILL, again and again, against the same run left alone.
 
-Half of the kills come after a random time, the others at a random operation on a file: before one is opened,
-within it, before it is flushed, linked, renamed or removed. What the resumed run is in the end (parameters,
+Half of the kills come at a random operation on a file (before one is opened, within it, before it is flushed,
+linked, renamed or removed), the others after a random time. What the resumed run is in the end (parameters,
 optimizer, replay with priorities, generators, environments, metrics but for wall time) must be what the other
 one is, bit for bit.
 """
@@ -96,7 +96,7 @@ def test_a_killed_run_ends_as_if_it_had_not_been(kind, tmp_path, amount, progres
         out, runs, status = tmp_path / f"killed_{runs}", runs + 1, None
         while status != 0:
             at, after = "", None
-            if kills < wanted and draw.random() < 0.5:
+            if kills < wanted and 2 * at_operations <= kills:
                 at = draw.randrange(operations // 2)
             elif kills < wanted:
                 after = draw.uniform(0.0, 0.5 * seconds)
