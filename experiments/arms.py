@@ -9,6 +9,7 @@ The thesis' six are a table here; a figure of your own is a small JSON file:
 `preset` takes any preset, `flags` any flag of a run beside it, with a list where it may be repeated.
 """
 
+import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -152,7 +153,7 @@ def figures_named(text: str, presets: Sequence[str] = ()) -> list[Figure]:
     if text == "all":
         return list(FIGURES.values())
     if text.endswith(".json"):
-        return [read_figure(Path(text))]
+        return [read_figure(Path(os.path.expanduser(text)))]
     names = text.split(",")
     for name in names:
         if name not in FIGURES:

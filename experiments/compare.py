@@ -6,7 +6,6 @@ interval are drawn. A table has the last value and the area under the curve, and
 without --out, it is all that is made.
 """
 
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -223,7 +222,7 @@ def compare(values: flags.FlagValues) -> None:
     if not values["runs"].value:
         raise ConfigError("--runs: missing; name two, srl-jax compare runs/a runs/b")
     named: dict[Path, Path] = {}  # a run by two names is one
-    for root in map(Path, map(os.path.expanduser, values["runs"].value)):
+    for root in (paths.given("runs", text) for text in values["runs"].value):
         named.setdefault(root.resolve(), root)
     roots = list(named.values())
     key, out = values["key"].value, values["out"].value

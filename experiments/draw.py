@@ -4,14 +4,13 @@ A run draws its figures when it ends. This command draws them again, and `--thes
 curve of the thesis. `srl-jax compare` draws several runs.
 """
 
-from pathlib import Path
-
 from absl import flags
 
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .drawing import plots, run_figures
 
 
@@ -19,11 +18,12 @@ def main(values: flags.FlagValues) -> None:
     """The entry point."""
     if not values.run:
         raise ConfigError("--run: missing; name a run directory, srl-jax draw runs/NAME")
-    config = Config.load(values.run)
+    path = paths.given("run", values.run)
+    config = Config.load(path)
     if not plots.available():
         raise ConfigError("figures need matplotlib and Pillow: pip install 'srl-jax[plots]'")
     try:
-        written = run_figures.draw_run(Path(values.run), config, thesis=values.thesis)
+        written = run_figures.draw_run(path, config, thesis=values.thesis)
     except OSError as error:
         raise ConfigError(f"--run={values.run}: {error.filename}: {error.strerror}") from None
     for path in written:

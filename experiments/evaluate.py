@@ -8,6 +8,7 @@ import dataclasses
 import functools
 import json
 from collections.abc import Callable
+from pathlib import Path
 
 from absl import flags
 
@@ -21,8 +22,8 @@ from .command_line import paths, runtime
 from .runs.run_data import read_rows
 
 
-def check_gif(path: str) -> None:
-    """Whether a GIF can be written there.
+def check_gif(path: str) -> Path:
+    """The path of a GIF that can be written.
 
     Raises:
         ConfigError: it cannot, or there is one already.
@@ -31,7 +32,7 @@ def check_gif(path: str) -> None:
 
     if not plots.available():
         raise ConfigError("--gif: needs matplotlib and Pillow, pip install 'srl-jax[plots]'")
-    paths.check_file("gif", path, ".gif")
+    return paths.check_file("gif", path, ".gif")
 
 
 def check_final(manifest: Manifest, values: flags.FlagValues) -> None:
@@ -65,12 +66,12 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
     """
     if not values.run:
         raise ConfigError("--run: missing; name a run directory or a checkpoint, srl-jax evaluate runs/NAME")
-    if values.gif:
-        check_gif(values.gif)
+    gif = check_gif(values.gif) if values.gif else None
+    run = paths.given("run", values.run)
     from srl_jax.files import checkpoint
     from srl_jax.learning.modes import MODES
 
-    manifest = checkpoint.read_manifest(values.run)
+    manifest = checkpoint.read_manifest(run)
     config = manifest.config
     if not MODES[config.mode].rl:
         raise ConfigError(f"--run={values.run}: a run of --mode={config.mode} has no policy to play with")
@@ -88,7 +89,7 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
 
     most = values.max_steps or config.eval_max_steps
     config = dataclasses.replace(config, eval_max_steps=most)
-    loaded = loading.load(values.run, imports=values["import"].value)
+    loaded = loading.load(run, imports=values["import"].value)
     manifest, seed = loaded.manifest, values.seed
     games, at_once = values.games, values.envs or config.eval_envs or config.num_envs
     key = jax.random.key(seed)
@@ -120,14 +121,14 @@ def main(values: flags.FlagValues, prepare: Callable[[str, str], None] | None = 
         "returns": played.returns,
         "lengths": played.lengths,
     }
-    if cut := played.cut(most):
-        display.say(f"{cut} of the games were cut at {most} env steps; --max_steps= sets where")
+    if played.cut:
+        display.say(f"{played.cut} of the games were cut at {most} env steps; --max_steps= sets where")
     display.result(json.dumps(result))
-    if values.gif:
+    if gif:
         from .drawing import images
 
         with saving(f"--gif={values.gif}"):
-            images.gif(played.frames[: played.lengths[0] + 1], values.gif)  # the first game
+            images.gif(played.frames[: played.lengths[0] + 1], gif)  # the first game
 
 
 def define_flags(values: flags.FlagValues) -> None:

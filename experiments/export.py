@@ -26,7 +26,7 @@ def main(values: flags.FlagValues) -> None:
 
     from srl_jax import encoders, loading
 
-    loaded = loading.load(values.run, imports=values["import"].value)
+    loaded = loading.load(paths.given("run", values.run), imports=values["import"].value)
     config, encoder = loaded.config, loaded.encoder
     about = {"game": config.game, "env_steps": loaded.env_steps}
     encoders.to_npz(path, encoder, loaded.params["encoder"], config.encoder, **about)

@@ -287,6 +287,13 @@ def run(values: flags.FlagValues) -> int:
     given = options.given_flags(values)
     if arms := [flag for flag, mine in OWN.items() if mine == "presets" and flag in given and not of_scores]:
         raise ConfigError(f"--{arms[0]}: the figure's arms decide it; a JSON file names arms of your own")
+    if values["redraw"].value:
+        own = (flag for flag in ("dry_run", *options.LAUNCHER, *given) if values[flag].present)
+        if flag := next((flag for flag in own if flag != "import"), None):
+            raise ConfigError(f"--{flag}: --redraw starts no run; leave one of them out")
+        if not values["seeds"].present:
+            drawn = {arm.name for figure in figures for arm in figure.arms}
+            seeds = sorted({run.seed for run in collect.load_runs(root) if run.arm in drawn}) or seeds
     runs = planned(figures, games, seeds, given)
     options.say_what_is_replaced(values, runs)
     text = values["published"].value
@@ -296,10 +303,6 @@ def run(values: flags.FlagValues) -> int:
         methods = _names(text, atari100k_methods()) if values["published"].present else None
     else:
         methods = _names(text, (entry.method for game in envs.ATARI_57 for entry in published(game)))
-    if values["redraw"].value:
-        own = (flag for flag in ("dry_run", *options.LAUNCHER, *given) if values[flag].present)
-        if flag := next((flag for flag in own if flag != "import"), None):
-            raise ConfigError(f"--{flag}: --redraw starts no run; leave one of them out")
     if values["dry_run"].value:
         workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
         entries = manifest.resolve(runs)

@@ -12,6 +12,7 @@ import gzip
 import itertools
 import json
 import os
+import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -153,7 +154,7 @@ def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, 
     A run that is under way, was stopped or killed is left out: it may still get other rows.
 
     Args:
-        root: a run keeps its path below it; where it is a run itself, its name.
+        root: a run keeps its path below it; where it is a run itself, its name, and that of its arm.
         folder: made if it is not there.
         stopped: whether to add runs that were stopped, too: nobody will resume them.
 
@@ -172,6 +173,8 @@ def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, 
     ready = [run.over or (stopped and run.ended is not None) for run in found]
     whole = added([], itertools.compress(found, ready))
     above = root.parent if found[0].path == root else root
+    if any(re.fullmatch(r"seed\d+", run.path.relative_to(above).as_posix()) for run in found):
+        above = above.parent  # which has the arm's name
     runs = added(here, (run._replace(path=folder / run.path.relative_to(above)) for run in whole))
     if len(runs) > len(here):
         write(folder, runs)
@@ -286,7 +289,7 @@ def main(values: flags.FlagValues) -> None:
     if not runs.is_dir():
         raise ConfigError(f"--runs={values.runs}: no such directory")
     one, other = runs.resolve(), out.resolve()
-    if not values.unpack and (one == other or one in other.parents or other in one.parents):
+    if one == other or (not values.unpack and (one in other.parents or other in one.parents)):
         raise ConfigError(f"--out={values.out}: name a folder that is neither in --runs nor around it")
     with saving(f"--out={out}"):
         if values.unpack:

@@ -77,7 +77,9 @@ def of_runs(root: Path, only: str | None = None, *, force: bool = False) -> dict
                 display.say(
                     f"{game}, {arm}: left out: {len(x)} run{'s'[: len(x) > 1]}, a spread takes {FEWEST}"
                 )
-        spreads = [Spread(arm, len(x), float(x.std(ddof=1))) for arm, x in areas.items() if len(x) >= FEWEST]
+        spreads = [  # less the first, of which those that are equal leave no rounding
+            Spread(arm, len(x), float((x - x[0]).std(ddof=1))) for arm, x in areas.items() if len(x) >= FEWEST
+        ]
         if spreads:
             found[game] = [*spreads, pooled(spreads)]
     if not found:

@@ -82,8 +82,9 @@ def report(values: flags.FlagValues) -> Path:
         "out", out, ".html", ".htm", overwrite=values["overwrite"].value, beside=".csv", deep=True
     )
     reach = check_reach(values["reach"].value)
-    for root in runs:
-        if not Path(root).is_dir():
+    roots = [paths.given("runs", root) for root in runs]
+    for root in roots:
+        if not root.is_dir():
             raise ConfigError(f"--runs={root}: no such directory")
     if missing := [name for module, name in NEEDED.items() if not importlib.util.find_spec(module)]:
         raise ConfigError(f"a report needs {', '.join(missing)}: pip install 'srl-jax[plots]'")
@@ -91,7 +92,7 @@ def report(values: flags.FlagValues) -> Path:
 
     table = path.with_suffix(".csv")
     same = {name: values[name].value for name in ("baseline", "force", "finished_only", "media")}
-    html, rows = page.build(*runs, reach=reach, data=table.name, **same)
+    html, rows = page.build(*roots, reach=reach, data=table.name, **same)
     with saving(f"--out={path}"):
         path.parent.mkdir(parents=True, exist_ok=True)
         for file, text in ((table, rows), (path, html)):

@@ -10,6 +10,7 @@ import re
 import sys
 from pathlib import Path
 
+from srl_jax import config
 from srl_jax.errors import ConfigError
 from srl_jax.files.rundir import put_back
 
@@ -47,7 +48,14 @@ def command_line(run: str) -> list[str]:
     numbers = ",".join(name.removeprefix("seed") for name in seeds)
     if len(seeds) == 1:
         numbers += ","  # a lone number is refused
-    return [f"--config={path / seeds[0] / 'config.json'}", f"--seeds={numbers}", *goes_on]
+    line = [f"--config={path / seeds[0] / 'config.json'}", f"--seeds={numbers}", *goes_on]
+    in_step = [config.read(path / name)[1].get("seeds") for name in seeds]
+    if None in in_step:
+        raise ConfigError(
+            f"{run}: runs of seeds, each by itself, as {seeds[in_step.index(None)]}/config.json says; name "
+            f"one of them. If one process of an earlier version trained them: srl-jax train {' '.join(line)}"
+        )
+    return line
 
 
 def main(argv: list[str]) -> None:

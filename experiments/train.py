@@ -302,7 +302,7 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
             if manifest:
                 begun = stack.enter_context(going_on(directory, manifest, its_config))
             else:
-                begun = stack.enter_context(run_directory(directory, its_config))
+                begun = stack.enter_context(run_directory(directory, its_config, seeds))
             started.callback(begun)
         caught = stack.enter_context(signals(again=interrupt))
         directories = [directory for directory, _ in runs]

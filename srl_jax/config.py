@@ -7,7 +7,7 @@ code. An "env step" is one decision of the agent, which is four emulator frames 
 
 import dataclasses
 import json
-from collections.abc import Callable, Collection, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -347,11 +347,10 @@ class Config:
         """The first env step not before this one that ends a round of the training environments."""
         return -(-env_steps // self.num_envs) * self.num_envs
 
-    def save(self, run: str | Path) -> None:
-        """Writes a run's config.json: the fields, what made the run, and when it began (UTC)."""
-        write(
-            run, {**dataclasses.asdict(self), **provenance.made_by(self.imports), "started": provenance.now()}
-        )
+    def save(self, run: str | Path, seeds: Sequence[int] = ()) -> None:
+        """Writes a run's config.json: fields, what made the run, when it began (UTC), seeds in step."""
+        made = {**provenance.made_by(self.imports), "started": provenance.now()}
+        write(run, {**dataclasses.asdict(self), **made, **({"seeds": list(seeds)} if seeds else {})})
 
 
 def read(run: str | Path) -> tuple[Config, dict[str, Any]]:

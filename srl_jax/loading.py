@@ -74,6 +74,9 @@ class Loaded:
     ) -> np.ndarray:
         """Greedy actions, int32 [...]; each with probability epsilon a uniformly random one instead.
 
+        They count from 0, as those of `srl_jax.envs` do: a loop over an environment whose actions start at
+        another number adds that.
+
         Args:
             observations: see above.
             epsilon: in [0, 1].
@@ -117,8 +120,9 @@ class Loaded:
                 f"observations must be uint8, or float32 in [0, 1], [..., {wanted}], not "
                 f"{observations.dtype} {given}"
             )
-        if isinstance(observations, np.ndarray) and observations.dtype == np.float32 and observations.size:
-            low, high = observations.min(), observations.max()
+        traced = isinstance(observations, jax.core.Tracer)
+        if not traced and observations.dtype == np.float32 and observations.size:
+            low, high = float(observations.min()), float(observations.max())
             if not 0 <= low <= high <= 1:
                 raise ValueError(
                     f"observations of float32 must be in [0, 1], not [{low:g}, {high:g}]; give bytes as uint8"

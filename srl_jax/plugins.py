@@ -145,7 +145,7 @@ def located(text: str, flag: str = "import") -> str:
     path = Path(os.path.abspath(os.path.expanduser(text)))
     if not _is_path(text):
         here = path.with_name(f"{path.name}.py")
-        return str(here) if here.is_file() else text
+        return str(here) if os.path.isfile(here) else text
     if path.suffix != ".py":
         raise ConfigError(f"--{flag}={text}: must be a file that ends in .py, or a module's name")
     return str(_checked(str(path), flag, "no such file"))

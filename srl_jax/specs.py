@@ -165,8 +165,9 @@ class Weight(float):
 
     def at(self, env_steps: int) -> float:
         """The number after so many env steps."""
-        share = min(1.0, env_steps / self.steps) if self.steps else 0.0
-        return float(self) + (self.final - float(self)) * share
+        if env_steps >= self.steps:
+            return self.final
+        return float(self) + (self.final - float(self)) * env_steps / self.steps
 
     def __eq__(self, other: object) -> bool:
         return repr(self) == repr(other)

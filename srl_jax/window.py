@@ -41,7 +41,13 @@ def image(window: Window, k: int) -> Array:
 
 
 def to_unit(pixels: Array) -> Array:
-    """uint8 0..255 -> float32 in [0, 1]; float32 passes as it is."""
+    """uint8 0..255 -> float32 in [0, 1]; float32 passes as it is.
+
+    Raises:
+        ValueError: another dtype: nobody knows what its numbers mean.
+    """
+    if pixels.dtype not in (jnp.uint8, jnp.float32):
+        raise ValueError(f"observations must be uint8, or float32 in [0, 1], not {pixels.dtype}")
     return pixels.astype(jnp.float32) / 255.0 if pixels.dtype == jnp.uint8 else pixels
 
 

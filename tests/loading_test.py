@@ -4,6 +4,7 @@ import re
 import shutil
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -80,9 +81,13 @@ def test_other_observations_are_refused(loaded, wrong, given):
         loaded.encode(wrong)
 
 
-def test_floats_that_are_bytes_are_refused(loaded):
+@pytest.mark.parametrize("make", [np.array, jnp.array])
+def test_floats_that_are_bytes_are_refused(loaded, make):
     with pytest.raises(ValueError, match=r"must be in \[0, 1\], not \[0, 255\]; give bytes as uint8$"):
-        loaded.encode(observations(2).astype(np.float32))
+        loaded.encode(make(observations(2), np.float32))
+    with pytest.raises(ValueError, match="must be in"):
+        loaded.q_values(make(np.full((42, 42, 4), np.nan, np.float32)))
+    assert jax.eval_shape(loaded.encode, jnp.zeros((2, 42, 42, 4))).shape == (2, 8)  # traced, nobody knows
 
 
 def test_epsilon_is_the_share_of_random_actions(loaded):

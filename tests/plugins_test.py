@@ -87,7 +87,7 @@ def test_a_name_is_registered_once(registry, tmp_path):
     assert registry["a"] is again
 
 
-@pytest.mark.parametrize("name", ["rl", "encoder", "encoder_srl", "rl_srl", "none"])
+@pytest.mark.parametrize("name", ["rl", "encoder", "encoder_srl", "rl_srl", "none", "total"])
 def test_an_objective_takes_no_name_of_the_agents_own(name):
     with pytest.raises(ConfigError, match=f"registers '{name}' in srl_jax.objectives, where the package"):
         objectives.register(name, _row)

@@ -1,10 +1,11 @@
 """srl_jax/window.py: which frames make up an observation, and in which order."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax.window import image, observation, only, stack_last
+from srl_jax.window import image, observation, only, stack_last, to_unit
 from tests.helpers import STACK, make_window
 
 
@@ -54,6 +55,12 @@ def test_image_is_the_observation_in_the_unit_interval():
     seen = np.asarray(image(window, 1))
     assert seen.dtype == np.float32 and seen.min() >= 0 and seen.max() <= 1
     np.testing.assert_array_equal(np.rint(seen * 255), observation(window, 1))
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.int8, np.float16, bool])
+def test_pixels_of_another_dtype_are_refused(dtype):
+    with pytest.raises(ValueError, match=rf"must be uint8, or float32 in \[0, 1\], not {np.dtype(dtype)}"):
+        to_unit(jnp.zeros((1, 2, 2, 1), dtype))
 
 
 def test_stack_last_moves_frames_and_their_channels_to_the_end():

@@ -57,6 +57,10 @@ def main() -> None:
     if name not in COMMANDS:
         config_flags.fail(f"{name}: no such command; {specs.choices_text(name, COMMANDS)}")
     sys.argv[:] = [f"srl-jax {name}", *rest]
-    if (here := os.getcwd()) not in sys.path:  # as `python -m` has it: --game=module:Name-v0 may lie here
+    try:
+        here = os.getcwd()
+    except OSError as error:
+        config_flags.fail(f"the working directory: {error.strerror}; cd to one that is there")
+    if here not in sys.path:  # as `python -m` has it: --game=module:Name-v0 may lie here
         sys.path.append(here)
     importlib.import_module(f"..{COMMANDS[name].module or name}", __package__).cli()

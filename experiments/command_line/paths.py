@@ -10,6 +10,21 @@ from pathlib import Path
 from srl_jax.errors import ConfigError
 
 
+def given(flag: str, text: str) -> Path:
+    """The path of what is read.
+
+    Args:
+        flag: that it came from.
+        text: its value, with or without ~.
+
+    Raises:
+        ConfigError: it is empty, as of a variable of the shell that is not set.
+    """
+    if not text:
+        raise ConfigError(f"--{flag}=: is empty; name a directory")
+    return Path(os.path.expanduser(text))
+
+
 def check_place(flag: str, text: str) -> Path:
     """The path of a directory that is there and can be written to, or can be made there; writes nothing.
 

@@ -13,7 +13,7 @@ from ..arms import FIGURES
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette: distinguishable to colour-blind readers."""
-LINES = ("-", "--", ":")
+LINES = ("-", "--", ":", "-.")
 """Of arms that have the same colour."""
 Style = tuple[str, str]
 """A colour and a line."""
@@ -23,7 +23,8 @@ def styles(arms: Sequence[str], among: Iterable[str] = ()) -> dict[str, Style]:
     """The colour and the line of each arm.
 
     Args:
-        arms: that are drawn together; where a colour comes again, the line is another one.
+        arms: that are drawn together; where a colour comes again, the line is another one. Of 28 no two look
+            alike: where an arm's colour has no line left, another colour has.
         among: all arms of the directory: they decide colours, too.
     """
     there = {*arms, *among}
@@ -34,6 +35,8 @@ def styles(arms: Sequence[str], among: Iterable[str] = ()) -> dict[str, Style]:
     found = {}
     for arm in dict.fromkeys(arms):
         colour = colours[arm]
+        if used[colour] >= len(LINES):
+            colour = min(COLOURS, key=used.__getitem__)
         found[arm] = colour, LINES[used[colour] % len(LINES)]
         used[colour] += 1
     return found

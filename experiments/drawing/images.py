@@ -3,10 +3,13 @@
 Pillow and matplotlib are imported where they are used, see `plots.available`.
 """
 
+import io
 import os
 from pathlib import Path
 
 import numpy as np
+
+from srl_jax.files.reading import replace_bytes
 
 from . import plots
 
@@ -85,6 +88,8 @@ def gif(frames: np.ndarray, path: str | os.PathLike, scale: int = 3) -> Path:
     first, *others = [Image.fromarray(frame[..., 0] if frame.shape[-1] == 1 else frame) for frame in frames]
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
+    file = io.BytesIO()
     # In milliseconds, whole hundredths of a second: about 15 frames a second.
-    first.save(path, format="GIF", save_all=True, append_images=others, duration=70, loop=0)
+    first.save(file, format="GIF", save_all=True, append_images=others, duration=70, loop=0)
+    replace_bytes(path, file.getvalue())
     return path

@@ -35,7 +35,7 @@ def text_of(path: Path) -> str | None:
         ConfigError: it cannot be read.
     """
     try:
-        return read_bytes(path, SETTINGS).decode("utf-8")
+        return read_bytes(path, SETTINGS).decode("utf-8-sig")
     except FileNotFoundError:
         return None
     except OSError as error:
@@ -70,7 +70,7 @@ def read(folder: Path) -> Readme | None:
 def _safe(token: Token, folder: Path, shown: list[Path]) -> Token:
     """The token as it may stand in a page that is read elsewhere; its picture becomes part of the page."""
     if token.type == "image":
-        path = (folder / unquote(str(token.attrs["src"]))).resolve()
+        path = (folder / unquote(str(token.attrs["src"])).replace("\0", "")).resolve()
         inside = path.is_relative_to(folder.resolve()) and path.suffix in (".png", ".gif")
         picture = pictures.taken(path, pictures.LARGEST) if inside else None
         if picture is None:

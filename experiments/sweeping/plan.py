@@ -124,7 +124,8 @@ def plan(
     """The runs of a sweep, each after those that it starts from.
 
     A run whose preset needs another's encoder or policy starts from the run of the arm that has the preset's
-    name; where there is none, one is added. Pretraining gets `PRETRAIN_SHARE` of the `steps` in `flags`.
+    name, or else of one with that preset and this arm's flags, as of a grid; where there is none, one is
+    added, with the flags for every run. Pretraining gets `PRETRAIN_SHARE` of the `steps` in `flags`.
 
     Args:
         arms: compared.
@@ -136,7 +137,7 @@ def plan(
         The first seed of everything, then the second, and so on.
 
     Raises:
-        ConfigError: a name is unknown, or two runs would have the same one.
+        ConfigError: a name is unknown, or two runs would have the same one, or a flag is there twice.
     """
     flags = _checked(flags or {})
     by_name: dict[str, Arm] = {}
@@ -150,6 +151,9 @@ def plan(
                 f"arm {arm.name}: there twice, of {by_name[arm.name].preset} and of {arm.preset}; "
                 "give one of them another name"
             )
+    for arm in by_name.values():
+        if both := sorted(flags.keys() & arm.flags.keys()):
+            raise ConfigError(f"--{both[0]}: arm {arm.name} has its own; give it once")
     if "import" not in flags:  # else it may be a row of what is imported, which the runs will know
         games = [envs.canonical(game, "games") for game in games]
     directories = {envs.file_name(game): game for game in reversed(games)}
@@ -162,7 +166,7 @@ def plan(
     def add(arm: Arm, game: str, seed: int) -> str:
         mode = arm.flags.get("mode", flags.get("mode", preset_values(arm.preset)["mode"]))
         own = {**flags, **arm.flags}
-        if mode == "pretrain" and "steps" in flags and "steps" not in arm.flags:
+        if mode == "pretrain" and "steps" in flags:
             own["steps"] = _pretraining(flags["steps"])
         sources = {}
         for flag, table in SOURCES.items():
@@ -170,7 +174,8 @@ def plan(
             preset = source_preset(arm.preset, table)
             if preset and mode == preset_values(arm.preset.partition("+")[0])["mode"]:
                 source = arm_of(preset)
-                named = by_name.get(source.name, source)
+                alike = (it for it in by_name.values() if (it.preset, it.flags) == (source.preset, arm.flags))
+                named = by_name.get(source.name) or next(alike, source)
                 if named.preset != source.preset:
                     raise ConfigError(
                         f"arm {named.name}: of {named.preset}, and {arm.name} starts from one of that name of"

@@ -126,7 +126,7 @@ class Latent(NamedTuple):
         """[B, H', W', C'] -> [B, D]; its layers belong to the module whose compact method calls it."""
         if self.pool == "average":
             x = jnp.mean(x, (1, 2))
-        x = x.reshape(x.shape[0], -1)
+        x = x.reshape(x.shape[0], math.prod(x.shape[1:]))
         if self.features:
             x = Dense(self.features)(x)
         for name in ENDS[self.end]:

@@ -11,9 +11,12 @@ from gymnasium.spaces import Box, Dict, Discrete, Space
 from srl_jax.envs import pixels
 from srl_jax.envs.base import FrameVectorEnv, check_number
 from srl_jax.errors import ConfigError
+from srl_jax.files import display
 
 PACKAGES = {"MiniGrid": "minigrid", "BabyAI": "minigrid", "MiniWorld": "miniworld", "ALE": "ale_py"}
 """The first word of ids: the package that has to be imported for gymnasium to know them."""
+LARGEST = float(np.finfo(np.float32).max)
+"""The largest reward, which replay keeps in 32 bits."""
 
 
 def made(id: str, render: bool) -> gymnasium.Env:
@@ -85,15 +88,16 @@ class Adapter(FrameVectorEnv):
         first = self._envs[0]
         actions = _actions(first)
         self._colours = 3 if render else _colours(first)
+        start = int(actions.start)
         names: list[str] = _attribute(first, "get_action_meanings", list)()
         height, width = (frame_size, frame_size) if frame_size else self._own_size()
         super().__init__(
             num_envs=num_envs,
             seed=seed,
             frame_shape=(height, width, 1 if grey else self._colours),
-            action_meanings=names if len(names) == actions.n else map(str, range(actions.n)),
+            action_meanings=names if len(names) == actions.n else map(str, range(start, start + actions.n)),
         )
-        self._first_action = int(actions.start)
+        self._first_action = start
         self.state_names = tuple(_attribute(first, "state_names", ()))
         self._resize = bool(frame_size)
         self._frames = np.zeros((num_envs, *self.single_observation_space.shape), np.uint8)
@@ -141,6 +145,10 @@ class Adapter(FrameVectorEnv):
         for _ in range(self._skip):
             observation, reward, terminated, truncated, info = self._envs[i].step(self._first_action + action)
             total += float(reward)
+            if not abs(total) <= LARGEST:
+                raise ConfigError(
+                    f"the environment gives a reward of {reward}; rewards must be finite in 32 bits"
+                )
             if terminated or truncated:
                 break
         self._actions[i].append(action)
@@ -168,8 +176,8 @@ class Adapter(FrameVectorEnv):
             image = pixels.resized(image, self._frames.shape[1])
         elif image.shape != self._frames[i].shape:
             raise ConfigError(
-                f"shows images of {list(image.shape)} and of {list(self._frames[i].shape)}; --frame_size=84, "
-                "say, makes them equal"
+                f"the environment shows images of {list(image.shape)} and of {list(self._frames[i].shape)}; "
+                "--frame_size=84, say, makes them equal"
             )
         self._frames[i] = image
         if self.state_names:
@@ -209,9 +217,12 @@ class Adapter(FrameVectorEnv):
         return {"ended": ended}
 
     def close_extras(self, **kwargs):
-        """Closes the environments."""
+        """Closes the environments; what one of them raises is said, and ends nothing."""
         for env in self._envs:
-            env.close()
+            try:
+                env.close()
+            except Exception as error:
+                display.say(f"an environment was not closed: {type(error).__name__}: {error}")
 
 
 def _attribute(env: gymnasium.Env, name: str, default: Any) -> Any:

@@ -20,8 +20,8 @@ PACKAGES = (
 )  # fmt: skip
 MADE_BY = ("versions", "git_revision", "environment", "cpus", "cores", "imported")
 """The keys of `made_by`."""
-ABOUT = (*MADE_BY, "started", "continued")
-"""What config.json holds beside the fields of Config."""
+ABOUT = (*MADE_BY, "started", "seeds", "continued")
+"""What config.json holds beside the fields of Config; "seeds" where one process trains several."""
 
 
 def made_by(imports: Iterable[str] = ()) -> dict[str, Any]:

@@ -8,7 +8,7 @@ import os
 import platform
 import shutil
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from srl_jax.config import Config
@@ -91,7 +91,9 @@ def held(run: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def run_directory(path: Path, config: Config | None) -> Iterator[Callable[[], None]]:
+def run_directory(
+    path: Path, config: Config | None, seeds: Sequence[int] = ()
+) -> Iterator[Callable[[], None]]:
     """Makes the run directory with its config.json, and yields what deletes the run that lay there before.
 
     That is called once the new run has begun; until then the old one is set aside, in `ASIDE`. It comes back
@@ -101,6 +103,7 @@ def run_directory(path: Path, config: Config | None) -> Iterator[Callable[[], No
     Args:
         path: of a directory that may be made, or may be emptied: a run that lies there is deleted.
         config: resolved; written to config.json. None: the directory is for those of several seeds.
+        seeds: that one process trains in step, for config.json; none of a run by itself.
 
     Raises:
         ConfigError: it cannot be made, or another process writes there, or to a seed's directory in it.
@@ -131,7 +134,7 @@ def run_directory(path: Path, config: Config | None) -> Iterator[Callable[[], No
                 try:
                     _set_aside(path)
                     if config is not None:
-                        config.save(path)
+                        config.save(path, seeds)
                 except OSError as error:
                     raise SaveError(f"--out={path}: {error.strerror}") from None
                 yield begun

@@ -38,6 +38,6 @@ REGISTRY = Registry(
         "bisimulation": bisimulation,
         "latent_l2": latent_l2,
     },
-    reserved=("none", RL, ENCODER, ENCODER_SRL, RL_SRL),
+    reserved=("none", "total", RL, ENCODER, ENCODER_SRL, RL_SRL),
 )
 register = REGISTRY.register

@@ -153,7 +153,10 @@ class Replay:
         Raises:
             ValueError: a shape, a dtype or a stream is wrong; nothing is stored then.
         """
-        streams = self._streams if streams is None else np.asarray(streams, np.int64)
+        streams = self._streams if streams is None else np.asarray(streams)
+        if streams.size and streams.dtype.kind not in "iu":
+            raise ValueError(f"streams must be indices, not {streams.dtype}")
+        streams = streams.astype(np.int64)
         if len(set(streams.ravel().tolist()) & set(range(self.num_streams))) != streams.size:
             raise ValueError(f"streams must be distinct and below {self.num_streams}: {streams}")
         frames = _check("frames", frames, (len(streams), *self.frame_shape), np.uint8)
@@ -237,8 +240,11 @@ class Replay:
             `set_priorities`: position * N + stream.
 
         Raises:
-            ValueError: nothing can be sampled yet, or batch_size is below 1.
+            ValueError: nothing can be sampled yet, or batch_size is below 1, or n_step is not in
+                1..horizon.
         """
+        if n_step is not None and not 1 <= n_step <= self.horizon:
+            raise ValueError(f"n_step must be in 1..{self.horizon}, the horizon, not {n_step}")
         if batch_size < 1 or not self.num_sampleable:
             raise ValueError(f"cannot draw {batch_size} of {self.num_sampleable} transitions")
         leaves = self.tree.sample_stratified(batch_size, self.rng if rng is None else rng)

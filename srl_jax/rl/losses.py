@@ -216,7 +216,12 @@ def n_step(
         r_t: float32 [...], the discounted sum of rewards.
         discount_t: float32 [...], the product of the discounts; 0 where a terminal state was met.
         offset: int32 [...], where to bootstrap from, 1..n steps after s_t.
+
+    Raises:
+        ValueError: n, an int, is not in 1..K.
     """
+    if isinstance(n, int) and not 1 <= n <= rewards.shape[-1]:
+        raise ValueError(f"n must be in 1..{rewards.shape[-1]}, the window's steps, not {n}")
     if not isinstance(n, int):  # what lies n steps ahead or more counts as behind the episode's end
         steps = rewards.shape[-1]
         valid, n = valid * (jnp.arange(steps) < n[..., None]), steps

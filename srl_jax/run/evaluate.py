@@ -18,15 +18,13 @@ class Evaluation(NamedTuple):
         lengths: env steps of each game.
         frames: uint8 [T, H, W, C], the first environment's games as they were seen, one after the other;
             empty unless asked for.
+        cut: how many were cut after `max_steps`, before they had ended.
     """
 
     returns: list[float]
     lengths: list[int]
     frames: np.ndarray
-
-    def cut(self, max_steps: int) -> int:
-        """How many games were cut after so many env steps."""
-        return sum(length >= max_steps for length in self.lengths)
+    cut: int
 
 
 def evaluate(
@@ -66,7 +64,7 @@ def evaluate(
     score, length = np.zeros(number), np.zeros(number, int)
     game = np.arange(number)  # that each environment plays; from `games` on they do not count
     recorded = [frames[0].copy()][:record]  # a view would keep the frames of all environments
-    step = played = 0
+    step = played = cut = 0
     while played < games:
         if stop():
             return None
@@ -77,9 +75,11 @@ def evaluate(
         stacks.push(frames)
         if len(recorded) < record and game[0] < games:
             recorded.append(frames[0].copy())
-        over = terminated | truncated | (length >= max_steps)
+        ended = terminated | truncated
+        over = ended | (length >= max_steps)
         if over.any():
             counts = over & (game < games)
+            cut += int((counts & ~ended).sum())
             returns[game[counts]], lengths[game[counts]] = score[counts], length[counts]
             played += int(counts.sum())
             game[over] += number
@@ -90,7 +90,7 @@ def evaluate(
                 recorded.append(frames[0].copy())
         told(step, played)
     seen = np.stack(recorded) if recorded else np.zeros((0, *shape), np.uint8)
-    return Evaluation(returns.tolist(), lengths.tolist(), seen)
+    return Evaluation(returns.tolist(), lengths.tolist(), seen, cut)
 
 
 def telling(progress: Progress, games: int, at_once: int, max_steps: int) -> Callable[[int, int], None]:

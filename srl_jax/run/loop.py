@@ -161,6 +161,8 @@ class Run:
             if resume is None:
                 start = initial_params(config, frame, self.agent)
                 states = [self.agent.init(seed.key, start) for seed in self.seeds]
+                for seed in self.seeds:
+                    seed.begin()
             else:
                 states = list(self.env_threads.map(Seed.restore, self.seeds, resume))
                 self.env_steps, self.updates = resume[0].env_steps, resume[0].updates
@@ -194,8 +196,8 @@ class Run:
             begun()
             for seed in self.seeds:
                 ending.clear(seed.out)
-                if seed.saved:
-                    saving.drop_after(seed.out, self.env_steps)
+                if seed.saved and saving.drop_after(seed.out, self.env_steps):
+                    seed.evaluations.best = -np.inf  # nothing is kept of what was best before
             self.begun = True
             try:
                 finished = self.run()
@@ -219,7 +221,6 @@ class Run:
         """
         config, first = self.config, self.seeds[0]
         if first.saved is None:
-            self.begin()
             self.start_evaluation()
         else:
             for seed in self.seeds:
@@ -288,11 +289,6 @@ class Run:
             self.save()
 
     # A step
-
-    def begin(self) -> None:
-        """Resets the training environments."""
-        for seed in self.seeds:
-            seed.begin()
 
     def step(self) -> None:
         """One step of every environment, and the updates that are due; before them a reset that is due."""

@@ -179,9 +179,8 @@ class Report:
         self.eval_row(env_steps, updates, row | dict(values), kind)
         what = "final evaluation" if kind == "final" else "evaluation"
         took = f"{games} games, {seconds:.1f} s"
-        most = self._config.eval_max_steps
-        if cut := played.cut(most):
-            took += f", {cut} of them cut at {most} env steps"
+        if played.cut:
+            took += f", {played.cut} of them cut at {self._config.eval_max_steps} env steps"
         self.progress.note(f"{what} after {env_steps} env steps: mean return {mean:.2f} over {took}")
         return mean
 

@@ -62,16 +62,21 @@ def slim_before(run: Path, env_steps: int) -> None:
                 checkpoint.slim(manifest)
 
 
-def drop_after(run: Path, env_steps: int) -> None:
+def drop_after(run: Path, env_steps: int) -> bool:
     """Removes the best parameters of after an env step that a run resumes from; it may not get there again.
+
+    Returns:
+        Whether they were all that was kept: what a checkpoint knows as the best is not there then.
 
     Raises:
         SaveError: they cannot be removed.
     """
-    for path in (run / "best").glob("[0-9]*"):
-        if int(path.name) > env_steps:
-            with saving(path, "not removed"):
-                shutil.rmtree(path)
+    kept = list((run / "best").glob("[0-9]*"))
+    later = [path for path in kept if int(path.name) > env_steps]
+    for path in later:
+        with saving(path, "not removed"):
+            shutil.rmtree(path)
+    return 0 < len(later) == len(kept)
 
 
 @contextlib.contextmanager

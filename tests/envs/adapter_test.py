@@ -118,7 +118,7 @@ def test_there_must_be_environments():
 def test_the_interface():
     env = make(num_envs=3)
     assert env.single_observation_space == Box(0, 255, (64, 64, 3), np.uint8)
-    assert env.single_action_space == Discrete(2) and env.action_meanings == ("0", "1")
+    assert env.single_action_space == Discrete(2) and env.action_meanings == ("5", "6")
     with pytest.raises(ResetNeeded):
         env.step(np.zeros(3, int))
     frames, info = env.reset()
@@ -309,6 +309,27 @@ def test_what_is_shown_must_be_what_was_announced():
     env = make(shows(Square.observation_space, Square.image, info=lambda self: {}))
     with pytest.raises(ConfigError, match=r"info\['state'\] must hold the 1 numbers of its state_names"):
         env.reset()
+
+
+@pytest.mark.parametrize("reward", [-np.inf, np.nan, 1e39])
+def test_a_reward_that_32_bits_cannot_hold_is_refused(reward):
+    env = make(
+        shows(Square.observation_space, Square.image, step=lambda self, _: (0, reward, False, False, {}))
+    )
+    env.reset()
+    with pytest.raises(ConfigError, match="gives a reward of .*; rewards must be finite in 32 bits"):
+        env.step(np.zeros(2, np.int32))
+
+
+def test_every_environment_is_closed_though_one_raises(capsys):
+    def close(self):
+        closed.append(self)
+        raise RuntimeError("no display")
+
+    closed = []
+    make(shows(Square.observation_space, Square.image, close=close)).close()
+    assert len(closed) == 2
+    assert capsys.readouterr().err.count("an environment was not closed: RuntimeError: no display") == 2
 
 
 def test_an_environment_by_its_id(tmp_path, monkeypatch):

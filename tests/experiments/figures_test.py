@@ -259,7 +259,10 @@ def _run(*arguments):
         (["--figure=6.3", "--redraw", "--lr_rl=0.5"], "--lr_rl: --redraw starts no run; leave one of them"),
         (["--figure=6.3", "--redraw", "--workers=3"], "--workers: --redraw starts no run"),
         (["--figure=6.3", "--redraw", "--dry_run"], "--dry_run: --redraw starts no run"),
-        (["--figure=6.3", "--games=Catch", "--redraw"], "no evaluation of any arm of figure 6.3"),
+        (
+            ["--figure=6.3", "--games=Catch", "--redraw", "--seeds=3"],
+            "no evaluation of any arm of figure 6.3",
+        ),
     ],
 )
 def test_bad_input_is_refused_and_nothing_written(tmp_path, arguments, told):
@@ -283,6 +286,16 @@ def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
         "rl_only_nature": [0, 1],
         "joint_256": [0, 1],
     }
+
+    # Without --seeds all that are there are drawn.
+    assert _run("--figure=6.3", "--games=Catch", "--redraw", f"--out={runs}") == 0
+    every = json.loads((runs / "figures" / "6.3.json").read_text())["games"]["Catch"]["arms"]
+    assert {arm: values["seeds"] for arm, values in every.items()} == {
+        "rl_only_nature": [0, 1],
+        "joint_256": [0, 1, 2],
+    }
+    assert _run("--figure=6.3", "--games=Catch", "--seeds=2", "--redraw", f"--out={runs}") == 0
+    capsys.readouterr()
 
     # Seeds that were asked for and are not there are said, and change nothing.
     before = (runs / "figures" / "6.3.json").read_bytes()

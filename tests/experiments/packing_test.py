@@ -136,17 +136,17 @@ def test_a_run_that_is_there_with_other_rows_or_settings_is_refused(root, tmp_pa
 
 def test_two_runs_have_two_places(root, tmp_path):
     over = Ending("finished", 200)
-    write_run(tmp_path / "a/seed0", seed=0, ended=over)
-    write_run(tmp_path / "b/seed0", seed=0, gamma=0.9, game="CatchDistractor", ended=over)
+    write_run(tmp_path / "a/one", seed=0, ended=over)
+    write_run(tmp_path / "b/one", seed=0, gamma=0.9, game="CatchDistractor", ended=over)
     packing.pack(tmp_path / "a", tmp_path / "out")
     with pytest.raises(
-        ConfigError, match=r"out/seed0: the place of Catch, .* and of CatchDistractor, .*seed 0"
+        ConfigError, match=r"out/one: the place of Catch, .* and of CatchDistractor, .*seed 0"
     ):
         packing.pack(tmp_path / "b", tmp_path / "out")
     configs = tmp_path / "out" / packing.CONFIGS
     text = configs.read_text()
-    for path in ("../seed0", "/tmp/seed0"):
-        configs.write_text(text.replace('"path": "seed0"', f'"path": "{path}"'))
+    for path in ("../one", "/tmp/one"):
+        configs.write_text(text.replace('"path": "one"', f'"path": "{path}"'))
         with pytest.raises(ConfigError, match=f"{path} is not below the folder"):
             packing.unpack(tmp_path / "out", tmp_path / "again")
 
@@ -156,6 +156,13 @@ def test_a_run_that_is_packed_by_itself_keeps_its_name(tmp_path):
         packing.pack(write_run(tmp_path / "runs" / name, ended=Ending("finished", 100)), tmp_path / "out")
     packing.unpack(tmp_path / "out", tmp_path / "again")
     assert [run.arm for run in collect.load_runs(tmp_path / "again")] == ["a", "b"]
+    # So does that of its seeds.
+    for seed in range(2):
+        write_run(tmp_path / f"joint/seed{seed}", seed=seed, ended=Ending("finished", 100))
+    for i, place in enumerate(("joint", "joint/seed0")):
+        packing.pack(tmp_path / place, tmp_path / f"packed{i}")
+        packing.unpack(tmp_path / f"packed{i}", tmp_path / f"unpacked{i}")
+        assert {run.arm for run in collect.load_runs(tmp_path / f"unpacked{i}")} == {"joint"}
 
 
 def test_what_packing_did_not_write_is_refused(root, tmp_path):
@@ -265,6 +272,7 @@ def test_the_command_line(root, tmp_path, capsys):
         ([tmp_path / "out", f"--out={tmp_path / 'new'}"], "out: no run directory there"),
         ([root, f"--out={root / 'alone_seed10/config.json'}"], "exists and is not a directory"),
         ([root, f"--out={tmp_path / 'new'}", "--unpack"], "configs.json: No such file"),
+        ([tmp_path / "out", f"--out={tmp_path / 'out'}", "--unpack"], "name a folder that is neither"),
     ):
         with pytest.raises(ConfigError, match=why):
             main(*arguments)

@@ -234,8 +234,7 @@ def test_resume_needs_nothing_but_the_directory(loop, tmp_path, monkeypatch):
 
 
 def test_resume_finds_the_seeds_of_a_process(loop, tmp_path):
-    for seed in (10, 2):
-        train_in_process(*CATCH, f"--seed={seed}", f"--out={tmp_path}/runs/seed{seed}")
+    train_in_process(*CATCH, "--seeds=10,2", f"--out={tmp_path}/runs")
     shutil.copytree(tmp_path / "runs/seed2", tmp_path / "runs/seed2_old")  # somebody's copy, and no seed
     assert resume.command_line(f"{tmp_path}/runs") == [
         f"--config={tmp_path}/runs/seed2/config.json", "--seeds=2,10", f"--out={tmp_path}/runs",
@@ -244,6 +243,13 @@ def test_resume_finds_the_seeds_of_a_process(loop, tmp_path):
     train_in_process(*CATCH, "--seeds=3,", f"--out={tmp_path}/one")
     train_in_process(*resume.command_line(f"{tmp_path}/one"))
     assert loop.seeds[-1] == [3] and loop.calls[-1][1] == tmp_path / "one/seed3"
+
+
+def test_resume_does_not_join_seeds_that_were_trained_by_themselves(loop, tmp_path):
+    for seed in (0, 1):
+        train_in_process(*CATCH, f"--seed={seed}", f"--out={tmp_path}/runs/seed{seed}")
+    with pytest.raises(ConfigError, match="each by itself, as seed0/config.json says; name one of them"):
+        resume.command_line(f"{tmp_path}/runs")
 
 
 def test_resume_refuses_what_is_no_run(tmp_path):

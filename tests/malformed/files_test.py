@@ -9,7 +9,6 @@ import socket
 
 import pytest
 
-from experiments.drawing import images
 from srl_jax.files import checkpoint
 from tests.malformed.conftest import CODE, DRAW, EVALUATE, GIVEN, OVERWRITE, START, TRAIN, call
 
@@ -260,11 +259,15 @@ def test_a_gif_that_is_not_written_is_one_line_and_the_scores_are_there(source, 
     def full(*_):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    monkeypatch.setattr(images, "gif", full)
-    assert call(*EVALUATE, "--gif=a.gif") == 3
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", full)
+        assert call(*EVALUATE, "--gif=a.gif") == 3
     printed = capsys.readouterr()
     assert printed.err == "error: --gif=a.gif: not written: No space left on device\n"
-    assert len(json.loads(printed.out)["returns"]) == 1
+    assert len(json.loads(printed.out)["returns"]) == 1 and not (folder / "a.gif").exists()
+    monkeypatch.setenv("HOME", str(folder / "home"))
+    (folder / "home").mkdir()
+    assert call(*EVALUATE, "--gif=~/a.gif") == 0 and (folder / "home/a.gif").exists()
 
 
 # What is not malformed

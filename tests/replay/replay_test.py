@@ -366,7 +366,7 @@ def test_a_bad_step_is_refused_and_changes_nothing(field, value):
     driver.check_windows()
 
 
-@pytest.mark.parametrize("streams", [[0, 0], [0, 2], [-1, 0], [[0, 1]]])
+@pytest.mark.parametrize("streams", [[0, 0], [0, 2], [-1, 0], [[0, 1]], [True, False], [0.0, 1.0]])
 def test_bad_streams_are_refused(streams):
     with pytest.raises(ValueError, match="streams|frames"):
         Driver(num_streams=2).replay.begin(np.zeros((2, 2, 1, 2), np.uint8), np.array(streams))
@@ -399,6 +399,9 @@ def test_nothing_to_sample():
     assert len(driver.replay) == 2
     with pytest.raises(ValueError, match="cannot draw 0 of 2"):
         driver.replay.sample(0, 0.4)
+    for n_step in (0, 3):
+        with pytest.raises(ValueError, match=rf"n_step must be in 1..2, the horizon, not {n_step}"):
+            driver.replay.sample(2, 0.4, n_step=n_step)
 
 
 def test_memory_of_a_slot():

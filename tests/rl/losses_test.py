@@ -336,6 +336,9 @@ def test_n_step_by_hand():
     np.testing.assert_array_equal(r_t, [3, 2, 2])
     np.testing.assert_array_equal(discount_t, [0.125, 0, 0.25])
     assert int(offset[0]) == 3 and int(offset[2]) == 2
+    for n in (0, 5):
+        with pytest.raises(ValueError, match=rf"n must be in 1..4, the window's steps, not {n}"):
+            n_step(rewards, discounts, valid, n)
 
 
 def test_the_defects_of_public_codes_by_hand():

@@ -66,6 +66,7 @@ def test_seeds_are_31_bits_and_differ_by_run_name_number_and_order():
 def test_linear_schedule_by_hand():
     # From 1 to 0.05 over 1,000 steps: half-way 0.525, then constant.
     values = [linear(1.0, 0.05, 1000, now) for now in (0, 500, 1000, 5000)]
+    assert values[2:] == [0.05, 0.05]  # to the bit
     assert values == pytest.approx([1.0, 0.525, 0.05, 0.05])
 
 

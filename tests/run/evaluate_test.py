@@ -96,7 +96,7 @@ def test_an_endless_game_is_cut_with_its_score_as_it_stands():
     env = Scripted([[None, [3.0]], [[1.0, 1.0, 1.0, 1.0]]])
     result = play(env, games=4, max_steps=4)
     assert result.returns == [4.0, 4.0, 3.0, 4.0]
-    assert result.lengths == [4, 4, 1, 4]
+    assert result.lengths == [4, 4, 1, 4] and result.cut == 1  # the others are of four steps by themselves
 
 
 @pytest.mark.parametrize("record", [1, 4, 5, 6, 100])

@@ -249,6 +249,15 @@ def test_what_ends_a_run_before_it_begins_leaves_how_it_ended_before(tmp_path, m
     assert ending.read(path) == ("finished", 40, "")
 
 
+def test_a_run_whose_environments_cannot_be_reset_has_not_begun(tmp_path, monkeypatch):
+    """So that what `--overwrite` replaces is still there."""
+    begun = []
+    monkeypatch.setattr(loop.Seed, "begin", mock.Mock(side_effect=RuntimeError("no display")))
+    with pytest.raises(RuntimeError):
+        loop.train(Config(**SMALL), tmp_path, progress=False, begun=lambda: begun.append(True))
+    assert not begun
+
+
 def test_how_a_run_ended_is_said_until_it_goes_on(tmp_path, monkeypatch):
     path, config = tmp_path / "run", Config(**SMALL)
     with stop_after(60) as stop:

@@ -136,7 +136,6 @@ def test_a_step_acts_with_the_parameters_from_before_its_updates():
     device = run.device
     run.device = device._replace(act=act, update=update)
     known.append(run.state.params)
-    run.begin()
     for _ in range(14):
         run.step()
     run.env_threads.shutdown()
@@ -308,7 +307,6 @@ def test_updates_are_compiled_once(joint):
     del joint
     run = one_run(Config(**SMALL, lr_final_share=0.5))
     (seed,) = run.seeds
-    run.begin()
     for _ in range(30):
         seed.take(*seed.step_env(np.ones(4, np.int32)))
     run.update()

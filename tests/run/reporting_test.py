@@ -225,7 +225,7 @@ def test_an_evaluation_says_how_many_games_were_cut(tmp_path, monkeypatch):
     said = []
     monkeypatch.setattr(report.progress, "note", said.append)
     with report:
-        for lengths in ([8, 3], [9, 3]):
-            report.evaluation("eval", 0, 0, Evaluation([1.0, 3.0], lengths, None), 2.0, {})
+        for cut in (0, 1):
+            report.evaluation("eval", 0, 0, Evaluation([1.0, 3.0], [9, 3], None, cut), 2.0, {})
     assert said[0] == "evaluation after 0 env steps: mean return 2.00 over 2 games, 2.0 s"
     assert said[1] == said[0] + ", 1 of them cut at 9 env steps"

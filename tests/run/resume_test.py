@@ -217,6 +217,13 @@ def test_a_best_policy_of_after_the_checkpoint_goes(stopped, tmp_path):
     go(config, run, 72, resume=[manifest])
     assert manifest.env_steps == 72
     assert [p.name for p in (run / "best").iterdir()] == [best.name]
+    # Where it was the only one that was kept, the best of before is gone with it, and any other is better.
+    again = shutil.copytree(path, tmp_path / "again")
+    (again / "best" / best.name).rename(again / "best" / f"{73:09d}")
+    one = make_run(config, again, resume=[manifest])
+    one.stop = lambda: True
+    one.train()
+    assert one.seeds[0].evaluations.best == -np.inf and not any((again / "best").iterdir())
 
 
 @pytest.mark.parametrize("steps", [104, 120])
@@ -246,7 +253,6 @@ def test_chunks_of_frames_that_nothing_was_written_to_are_links(tmp_path, monkey
     manifest = checkpoint.newest_good(tmp_path / "run", pytest.fail)
     run = make_run(config, tmp_path / "run", resume=[manifest])
     other = make_run(make_config("rl_only", checkpoint_every=104), tmp_path / "other")
-    other.begin()
     while other.env_steps < 156:
         other.step()
     np.testing.assert_array_equal(run.seeds[0].replay.frames, other.seeds[0].replay.frames)

@@ -1,5 +1,7 @@
 """Tests of srl_jax.statistics.power, and of experiments.power."""
 
+import shutil
+
 import numpy as np
 import pytest
 from absl import flags
@@ -83,6 +85,12 @@ def test_the_spread_of_runs_is_that_of_their_area(tmp_path, capsys):
         for seed in range(3):
             write_run(tmp_path / arm / f"seed{seed}", (step * seed, step * seed), seed=seed)
     write_run(tmp_path / "few/seed0", (0, 0))
+    for seed in range(3):  # a mean of three of which is another number by a rounding
+        write_run(
+            tmp_path / f"CatchDistractor/same/seed{seed}", (0.1, 0.1), seed=seed, game="CatchDistractor"
+        )
+    assert _lines(f"--from={tmp_path}", "--effect=2", "--game=CatchDistractor")[1][2] == "0"
+    shutil.rmtree(tmp_path / "CatchDistractor")
     head, *rows = _lines(f"--from={tmp_path}", "--effect=2")
     assert head[0] == "Catch"
     assert [row[:3] for row in rows[:2]] == [["a", "3", "1"], ["b", "3", "3"]]

@@ -31,3 +31,6 @@ def test_as_many_arms_as_there_are_colours_differ_and_more_have_another_line():
     found = list(styles([f"arm{i:02}" for i in range(2 * count)]).values())
     assert sorted(colour for colour, _ in found[:count]) == sorted(COLOURS)
     assert [line for _, line in found] == ["-"] * count + ["--"] * count
+    few = styles(["a00", "a07", "a14", "a21", "a28", "a01"], among=[f"a{i:02}" for i in range(40)])
+    assert len(set(few.values())) == 6  # five of them have the same colour among all
+    assert len(set(styles([f"a{i:02}" for i in range(4 * count)]).values())) == 4 * count

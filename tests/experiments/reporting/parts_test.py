@@ -129,6 +129,9 @@ def test_a_picture_of_a_readme_may_have_any_name(tmp_path):
     Image.new("RGB", (4, 4)).save(tmp_path / "größe 1.png")
     (tmp_path / "README.md").write_text("# A\n\n![x](größe%201.png)\n", encoding="utf-8")
     assert pages.readme.read(tmp_path).pictures == [tmp_path / "größe 1.png"]
+    (tmp_path / "README.md").write_text("\ufeff# A\n\n![x](a%00.png)\n", encoding="utf-8")
+    found = pages.readme.read(tmp_path)
+    assert found.title == "A" and found.pictures == []
 
 
 def test_a_run_that_starts_from_a_best_checkpoint_starts_from_its_arm():

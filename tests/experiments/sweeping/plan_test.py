@@ -26,7 +26,7 @@ def test_what_a_run_starts_from_is_planned_once_and_before_it():
 
 def test_an_arm_may_be_the_source_of_another():
     arms = [arm_of("small/frozen_256"), Arm("pretrain_256", "small/pretrain_256", {"steps": "77"})]
-    runs = {run.name: run for run in plan.plan(arms, ["Catch"], [3], {"steps": "1e3", "gamma": "0.9"})}
+    runs = {run.name: run for run in plan.plan(arms, ["Catch"], [3], {"gamma": "0.9"})}
     assert len(runs) == 3
     assert runs["Catch/pretrain_256/seed3"].flags == {
         "game": "Catch", "seed": "3", "steps": "77", "gamma": "0.9",
@@ -62,6 +62,7 @@ def test_what_a_process_elsewhere_imports_is_named_absolutely(tmp_path, monkeypa
         ([arm_of("small/joint_256")], ["Pang"], {}, "--games=Pang: did you mean Pong"),
         ([arm_of("small/joint_256")], [], {"encoder_from": "x"}, "--encoder_from"),
         ([arm_of("small/frozen_256")], [], {"steps": "many"}, "--steps=many"),
+        ([Arm("a", "small/joint_256", {"lr_rl": "1"})], [], {"lr_rl": "2"}, "--lr_rl: arm a has its own"),
     ],
 )
 def test_what_cannot_be_planned(arms, games, flags, says):
@@ -195,6 +196,12 @@ def test_a_grid_is_an_arm_for_each_combination():
         (lr, rl) for lr in (1e-4, 3e-4) for rl in ("rainbow", "dqn")
     }
     assert plan.grid(arms[:1], [], {}) == arms[:1]
+    # What an arm starts from has the values that it has itself, where that is an arm, too.
+    pair = [arm_of("small/pretrain_256"), arm_of("small/frozen_256")]
+    runs = {run.name: run for run in plan.plan(plan.grid(pair, ["batch_size=8,16"], {}), ["Catch"], [0])}
+    for size in (8, 16):
+        frozen = runs[f"Catch/frozen_256_batch_size={size}/seed0"]
+        assert frozen.encoder_from == f"Catch/pretrain_256_batch_size={size}/seed0"
     arms = plan.grid([Arm("a", "catch/rl_only")], ["protocol=thesis,machado"], {})
     entries = manifest.resolve(plan.plan(arms, [], [0], {}))
     assert [config.eps_eval for _, config in entries.values()] == [0.005, 0.01]
