@@ -6,6 +6,7 @@ interval are drawn. A table has the last value and the area under the curve, and
 without --out, it is all that is made.
 """
 
+import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -65,8 +66,10 @@ def read(roots: Sequence[Path], key: str, *, force: bool = False) -> tuple[list[
         ConfigError: there is one curve, no run has the key, or runs cannot be compared.
     """
     found: list[list[RunData]] = []
+    seen: set[str] = set()  # a run by two names is one
     for root in roots:
-        runs = collect.load_runs(root)
+        runs = [run for run in collect.load_runs(root) if os.path.realpath(run.path) not in seen]
+        seen |= {os.path.realpath(run.path) for run in runs}
         collect.check_arms(runs)
         found += [members for arms in collect.grouped(runs).values() for members in arms.values()]
     if len(found) < 2:
@@ -221,10 +224,7 @@ def compare(values: flags.FlagValues) -> None:
     """
     if not values["runs"].value:
         raise ConfigError("--runs: missing; name two, srl-jax compare runs/a runs/b")
-    named: dict[Path, Path] = {}  # a run by two names is one
-    for root in (paths.given("runs", text) for text in values["runs"].value):
-        named.setdefault(root.resolve(), root)
-    roots = list(named.values())
+    roots = [paths.given("runs", text) for text in values["runs"].value]
     key, out = values["key"].value, values["out"].value
     path = paths.check_file("out", out, ".png", overwrite=values["overwrite"].value) if out else None
     if path and not plots.available():

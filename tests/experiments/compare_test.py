@@ -147,7 +147,7 @@ def test_packed_runs_and_folders_of_arms_are_read_alike(runs, tmp_path, capsys):
     [
         ((), "--runs: missing; name two"),
         (("a",), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
-        (("a", "a/", "linked"), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
+        (("a", "a/", "linked", "a/seed0"), "^a: one curve; name a second run, .*; srl-jax draw draws one"),
         (("a", "nothing"), "nothing: no run directory there"),
         (("a", "b", "--key=eval/return_men"), "no run has it; there are eval/return_mean"),
         (("a", "c", "--key=nope"), "no run has it; there are eval/return_mean, loss/x, updates, wall_s$"),
