@@ -211,8 +211,8 @@ def draw(campaign: Path, path: Path) -> Path:
             curve = plots.Curve(at, *zip(*((x.point, x.low, x.high) for x in found), strict=True))
             drawn.append(plots.Line(name, curve, min(len(values[arm]) for arm in its.values())))
         level = plots.Level(reference, float(values[reference].mean()))
-        across = f"{doses['across']} (powers of ten)"
-        panels.append(plots.Panel("", drawn, [level], title=title, across=across))
+        ticks = {float(np.log10(float(dose))): dose for its in lines.values() for dose in its}
+        panels.append(plots.Panel("", drawn, [level], title=title, across=doses["across"], ticks=ticks))
     return plots.draw_panels(panels, path, "", label="area under the learning curve")
 
 

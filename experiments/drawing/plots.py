@@ -10,6 +10,7 @@ import os
 import textwrap
 from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -81,6 +82,7 @@ class Panel(NamedTuple):
         title, across: above it and below; empty for the game and its env steps.
         limits: of the vertical axis; None for what `heights` gives.
         log: whether that is logarithmic, where all values are positive and span a factor of 5 or more.
+        ticks: {where on the horizontal axis: what stands there}; none for numbers.
     """
 
     game: str
@@ -91,6 +93,7 @@ class Panel(NamedTuple):
     across: str = ""
     limits: tuple[float, float] | None = None
     log: bool = False
+    ticks: Mapping[float, str] = MappingProxyType({})
 
 
 def interval_curve(runs: Sequence[tuple[np.ndarray, np.ndarray]]) -> Curve | None:
@@ -175,6 +178,8 @@ def _draw_panel(axes, panel: Panel, looks: Mapping[str, Style]) -> dict[str, Any
         axes.set_xlim(0, end)
     else:
         plain(axes)
+    if panel.ticks:
+        axes.set_xticks([*panel.ticks], [*panel.ticks.values()])
     shown = [line.get_ydata() for line in axes.lines]
     shown += [x for line in lines if line.seeds < 2 for x in (line.curve.low, line.curve.high)]
     shown = np.concatenate([*shown, [x.score for x in (*panel.levels, *panel.policies)]])
