@@ -131,13 +131,12 @@ def make_context(features: int = 8) -> Context:
     return Context.of(make_encoder(features), NUM_ACTIONS)
 
 
-def make_encoder(features: int = 8) -> Encoder:
+def make_encoder(features: int = 8, shape=(SIZE, SIZE, STACK)) -> Encoder:
     """A linear encoder with a tanh and a linear decoder.
 
     Losses see latents and a decoder, whatever they are made of, and these compile quickly.
     """
-    shape = (SIZE, SIZE, STACK)
-    pixels = SIZE * SIZE * STACK
+    pixels = int(np.prod(shape))
 
     def linear(inputs: int, outputs: int):
         return lambda key: {"kernel": jax.random.normal(key, (inputs, outputs)) / np.sqrt(inputs)}
@@ -330,7 +329,8 @@ def draw(*shape: int, seed: int = 0) -> np.ndarray:
 def loss_of(objective: Objective, latents: Latents, window: Window, *, seed: int = 0, key: int = 0):
     """The losses of a head of random numbers, that head, and its slow copy, which is another one."""
     head, slow = (random_params(objective.init, seed + i) for i in range(2))
-    return np.asarray(objective.loss(head, slow, latents, window, jax.random.key(key))[0]), head, slow
+    loss = jax.jit(lambda *heads: objective.loss(*heads, latents, window, jax.random.key(key))[0])
+    return np.asarray(loss(head, slow)), head, slow
 
 
 def last_of_each(arguments: Iterable[str]) -> tuple[str, ...]:

@@ -90,12 +90,18 @@ def test_conv_pads_as_jax_does(kernel, stride, shape, padding, dtype):
         "kernel": rng.normal(size=(kernel, kernel, 3, 5)).astype(np.float32),
         "bias": rng.normal(size=5).astype(np.float32),
     }
-    ours = Conv(5, kernel, stride, padding=padding).apply({"params": params}, x)
-    theirs = params["bias"] + jax.lax.conv_general_dilated(
-        x.astype(np.float32), params["kernel"], (stride, stride), [(2, 2)] * 2 if padding == 2 else padding,
-        dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest",
-    )  # fmt: skip
-    np.testing.assert_allclose(ours, theirs, rtol=1e-4, atol=2e-2)
+
+    pads = [(2, 2)] * 2 if padding == 2 else padding
+
+    @jax.jit
+    def both(params, x):
+        theirs = params["bias"] + jax.lax.conv_general_dilated(
+            x.astype(np.float32), params["kernel"], (stride, stride), pads,
+            dimension_numbers=("NHWC", "HWIO", "NHWC"), precision="highest",
+        )  # fmt: skip
+        return Conv(5, kernel, stride, padding=padding).apply({"params": params}, x), theirs
+
+    np.testing.assert_allclose(*both(params, x), rtol=1e-4, atol=2e-2)
 
 
 @pytest.mark.parametrize("padding", ["same", -1, ((0, 1),), ((0, 1), (0, -1))])

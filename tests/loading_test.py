@@ -38,8 +38,8 @@ def observations(*shape, seed=0):
 
 def test_latents_values_and_actions_are_the_agents(loaded):
     x, agent, params = observations(5), loaded.agent, loaded.params
-    z = agent.encoder.apply(params["encoder"], x)
-    q = agent.algorithm.q_values(params["rl"], z)
+    z = jax.jit(agent.encoder.apply)(params["encoder"], x)
+    q = jax.jit(agent.algorithm.q_values)(params["rl"], z)
     np.testing.assert_allclose(loaded.encode(x), z, atol=1e-5)
     np.testing.assert_allclose(loaded.q_values(x), q, atol=1e-5)
     assert loaded.encode(x).dtype == loaded.q_values(x).dtype == np.float32

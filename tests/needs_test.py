@@ -20,8 +20,8 @@ from srl_jax.needs import EVERYTHING, Unread
 from srl_jax.rl.values import PRIORITIES
 from srl_jax.training import completed, refuse_unread
 from srl_jax.types import Context
-from tests.helpers import NUM_ACTIONS, SMALL
-from tests.observed import BESIDE, of_agent, of_algorithm, of_encoder, of_objective
+from tests.helpers import NUM_ACTIONS, SMALL, make_encoder
+from tests.observed import BESIDE, Observed, of_agent, of_algorithm, of_encoder, of_objective
 
 ENCODER = encoders.tiny((18, 18, 4), features=8)
 CONTEXT = Context.of(ENCODER, NUM_ACTIONS)._replace(rl_layer=BESIDE.first_layer)
@@ -63,14 +63,14 @@ def others(kind: str, row: str, option: str, value) -> list[str]:
 
 
 @functools.cache
-def observed(kind: str, text: str) -> dict:
+def observed(kind: str, text: str) -> Observed:
     """What a row does."""
     registry = REGISTRIES[kind]
     spec = specs.parse(text, registry, kind)
     if kind == "encoder":
         return of_encoder(plugins.build(spec, registry, (84, 84, 4)))
     found = plugins.build(spec, registry, CONTEXT)
-    return (of_algorithm if kind == "rl" else of_objective)(found, ENCODER)
+    return of_algorithm(found, make_encoder()) if kind == "rl" else of_objective(found, ENCODER)
 
 
 def refusal(kind: str, text: str, option: str) -> str:
@@ -237,7 +237,7 @@ OF_HOST = {
 
 def base(name: str, **values) -> Config:
     unread = {"eval_games", "slow_update_every"} | ({"rl"} if "pretrain" in str(BASES[name]) else set())
-    small = {**SMALL, "rl": f"rainbow:{LEAN}", "diagnostics": True}
+    small = {**SMALL, "rl": f"rainbow:{LEAN}", "encoder": "linear", "diagnostics": True}
     return Config(**{**{k: x for k, x in small.items() if k not in unread}, **BASES[name], **values})
 
 
@@ -250,9 +250,15 @@ def resolved(config: Config, given) -> Config:
     return full
 
 
-@functools.cache
-def seen(config: Config) -> dict:
-    return of_agent(config)
+seen = functools.cache(of_agent)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def linear():
+    """A row of encoders that is traced fast; ROWS are the package's."""
+    encoders.REGISTRY["linear"] = lambda shape: make_encoder(shape=shape)
+    yield
+    del encoders.REGISTRY["linear"]
 
 
 def test_every_flag_that_is_not_always_read_is_tried():

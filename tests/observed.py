@@ -2,7 +2,7 @@
 
 import inspect
 import re
-from functools import partial
+from functools import cache, partial
 
 import jax
 import numpy as np
@@ -20,6 +20,17 @@ from tests.helpers import NUM_ACTIONS, make_window
 KEY = jax.eval_shape(lambda: jax.random.key(0))
 BESIDE = REGISTRY["dqn"](Context(8, NUM_ACTIONS), hidden=8)
 """The RL algorithm beside an objective, whose head that may read."""
+
+
+class Observed:
+    """What is seen, in parts: those that take longer to see behind others, and each once it is asked for."""
+
+    def __init__(self, **parts):
+        self.parts = {name: cache(part) for name, part in parts.items()}
+
+    def __eq__(self, other) -> bool:
+        same = self.parts.keys() == other.parts.keys()
+        return same and all(part() == other.parts[name]() for name, part in self.parts.items())
 
 
 def computed(function, *arguments) -> str:
@@ -42,29 +53,30 @@ def computed(function, *arguments) -> str:
     return f"{text} {[np.asarray(x).tobytes() for x in constants.values()]} {results}"
 
 
-def of_encoder(encoder: Encoder) -> dict:
+def of_encoder(encoder: Encoder) -> Observed:
     """What an encoder and its decoder compute."""
     params, decoder = jax.eval_shape(encoder.init, KEY), encoder.make_decoder()
     image = jax.ShapeDtypeStruct((2, *encoder.observation_shape), np.uint8)
     latent = jax.ShapeDtypeStruct((2, encoder.features), np.float32)
-    found = {}
-    if train := encoder.train:
-        found["train"] = computed(jax.grad(lambda *x: train(*x).sum()), params, image, KEY)
-    return found | {
-        "init": computed(encoder.init, KEY),
-        "apply": computed(encoder.apply, params, image),
-        "decoder": computed(decoder.init, KEY),
-        "decoded": computed(decoder.apply, jax.eval_shape(decoder.init, KEY), latent),
+    parts = {
+        "init": lambda: computed(encoder.init, KEY),
+        "apply": lambda: computed(encoder.apply, params, image),
+        "decoder": lambda: computed(decoder.init, KEY),
+        "decoded": lambda: computed(decoder.apply, jax.eval_shape(decoder.init, KEY), latent),
     }
+    if train := encoder.train:
+        parts["train"] = lambda: computed(jax.grad(lambda *x: train(*x).sum()), params, image, KEY)
+    return Observed(**parts)
 
 
-def of_objective(objective: Objective, encoder: Encoder, read=lambda metrics: metrics) -> dict:
+def of_objective(objective: Objective, encoder: Encoder, read=lambda metrics: metrics, **parts) -> Observed:
     """What an objective computes, its schedule, how its slow copy moves, and its picture.
 
     Args:
         objective: built for the encoder.
         encoder: below it.
         read: metrics -> those that somebody reads.
+        **parts: what else is seen.
     """
     own, params = jax.eval_shape(objective.init, KEY), jax.eval_shape(encoder.init, KEY)
     groups = {ENCODER: params, RL: jax.eval_shape(BESIDE.objective.init, KEY)}
@@ -76,41 +88,40 @@ def of_objective(objective: Objective, encoder: Encoder, read=lambda metrics: me
         losses, metrics = objective.loss(head, slow_head, latents, window, key)
         return losses, read(metrics)
 
-    found = {
-        "init": computed(objective.init, KEY),
-        "loss": computed(loss, head, head, params, params, window, KEY),
-        "rest": (repr(objective.weight), objective.horizon, objective.is_decoder),
+    parts = {
+        "rest": lambda: (repr(objective.weight), objective.horizon, objective.is_decoder),
+        **parts,
+        "init": lambda: computed(objective.init, KEY),
     }
     if objective.slow:
         copies = {"encoder": params, "head": head}
-        found["slow"] = computed(objective.slow, copies, copies, np.int32(1))
+        parts["slow"] = lambda: computed(objective.slow, copies, copies, np.int32(1))
+    parts["loss"] = lambda: computed(loss, head, head, params, params, window, KEY)
     if objective.image:
         picture = lambda head, params, window: objective.image(  # noqa: E731
             head, make_latents(encoder, params, params, window), window
         )
-        found["image"] = computed(picture, head, params, window)
-    return found
+        parts["image"] = lambda: computed(picture, head, params, window)
+    return Observed(**parts)
 
 
-def of_algorithm(algorithm: Algorithm, encoder: Encoder) -> dict:
+def of_algorithm(algorithm: Algorithm, encoder: Encoder) -> Observed:
     """What an algorithm computes, and what it asks of replay; priorities count where there are some."""
     prioritized = algorithm.alpha > 0
     objective = algorithm.objective._replace(slow=algorithm.slow(7))
     head = jax.eval_shape(objective.init, KEY)
     latent = jax.ShapeDtypeStruct((2, encoder.features), np.float32)
-    return {
-        **of_objective(
-            objective,
-            encoder,
-            lambda metrics: {k: x for k, x in metrics.items() if prioritized or k != "td_error"},
-        ),
-        "act": computed(algorithm.q_values, head, latent, KEY),
-        "evaluate": computed(algorithm.q_values, head, latent),
-        "asks": (algorithm.alpha, algorithm.acts_slow),
-    }
+    return of_objective(
+        objective,
+        encoder,
+        lambda metrics: {k: x for k, x in metrics.items() if prioritized or k != "td_error"},
+        asks=lambda: (algorithm.alpha, algorithm.acts_slow),
+        act=lambda: computed(algorithm.q_values, head, latent, KEY),
+        evaluate=lambda: computed(algorithm.q_values, head, latent),
+    )
 
 
-def of_agent(config: Config) -> dict:
+def of_agent(config: Config) -> Observed:
     """What an agent on Catch computes in the middle of a run of this configuration, and what it asks for.
 
     The numbers of schedules are constants of what is traced: what nothing computes with is left out.
@@ -127,6 +138,7 @@ def of_agent(config: Config) -> dict:
     if agent.mode.rl and "n_step" in now.gamma_and_n:
         window = window._replace(n_step=np.full(4, now.gamma_and_n["n_step"], np.int32))
 
+    @cache
     def computed_by(update):
         def updated(state, window):
             state, td_error, metrics = update.pure(state, window, now.hyper)
@@ -134,24 +146,27 @@ def of_agent(config: Config) -> dict:
 
         return computed(updated, state, window)
 
-    found: dict = {
-        "init": computed(inspect.unwrap(agent.init), KEY),
-        "update": computed_by(agent.update),
-        "asks": (agent.horizon, alpha, updates, schedules.resets(env_steps)),
-    }
-    if agent.update_rl and (alone := computed_by(agent.update_rl)) != found["update"]:
-        found["update_rl"] = config.srl_every, alone
-    if agent.norms:
-        found["norms"] = computed(lambda *x: inspect.unwrap(agent.norms)(*x, now.hyper), state, window)
-    if agent.follow_every:
-        found["follow"] = agent.follow_every, computed(inspect.unwrap(agent.follow), state)
+    def update_rl():
+        """Of the updates that are RL's alone."""
+        alone = computed_by(agent.update_rl or agent.update)
+        return alone != computed_by(agent.update) and (config.srl_every, alone)
+
+    asks = agent.horizon, alpha, updates, schedules.resets(env_steps)
+    parts: dict = {"asks": lambda: asks, "epsilon": lambda: config.policy_from and now.epsilon}
     if agent.mode.rl:
         act = lambda state, *rest: inspect.unwrap(agent.act)(agent.acting(state), *rest)  # noqa: E731
         frames = window.frames[:, : config.frame_stack]
-        found["act"] = now.epsilon, computed(act, state, frames, KEY, np.int32(0), np.float32(0))
-        found["replay"] = now.gamma_and_n.get("gamma", config.gamma), now.beta if alpha else None
-    if config.policy_from:
-        found["given policy"] = now.epsilon
+        replay = now.gamma_and_n.get("gamma", config.gamma), now.beta if alpha else None
+        parts["replay"] = lambda: (now.epsilon, *replay)
+        parts["act"] = lambda: computed(act, state, frames, KEY, np.int32(0), np.float32(0))
     if config.reset != "none":
-        found["reset"] = computed(partial(reset, kind=config.reset, shrink=config.shrink), state, state)
-    return found
+        whole = partial(reset, kind=config.reset, shrink=config.shrink)
+        parts["reset"] = lambda: computed(whole, state, state)
+    if agent.follow_every:
+        parts["follow"] = lambda: (agent.follow_every, computed(inspect.unwrap(agent.follow), state))
+    if agent.norms:
+        norms = lambda *x: inspect.unwrap(agent.norms)(*x, now.hyper)  # noqa: E731
+        parts["norms"] = lambda: computed(norms, state, window)
+    init = inspect.unwrap(agent.init)
+    parts |= {"init": lambda: computed(init, KEY), "update": lambda: computed_by(agent.update)}
+    return Observed(**parts, update_rl=update_rl)

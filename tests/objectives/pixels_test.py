@@ -85,11 +85,9 @@ def test_the_gradient_penalty_of_a_linear_decoder_is_its_kernels_size():
     plain, penalised = (objectives.reconstruction(context, gradient_penalty=p) for p in (0.0, 2.0))
     latents = latents_of(draw(1, BATCH, 8))
     head = helpers.random_params(plain.init)
-    rows = [
-        np.asarray(penalised.loss(head, None, latents, window, jax.random.key(k))[0])
-        - np.asarray(plain.loss(head, None, latents, window, jax.random.key(k))[0])
-        for k in range(30)
-    ]
+    losses = lambda of, key: of.loss(head, None, latents, window, key)[0]  # noqa: E731
+    more = jax.jit(jax.vmap(lambda key: losses(penalised, key) - losses(plain, key)))
+    rows = more(jax.random.split(jax.random.key(0), 30))
     expected = 2.0 * np.sum(np.asarray(head["kernel"]) ** 2) / (6 * 6 * 4)
     assert np.mean(rows) == pytest.approx(expected, rel=0.15)
 
@@ -97,13 +95,13 @@ def test_the_gradient_penalty_of_a_linear_decoder_is_its_kernels_size():
 def test_a_largest_singular_value_and_its_gradient_by_hand():
     # The columns' lengths are 5 and 1, and they are orthogonal: u = (0.6, 0.8, 0), v = (1, 0).
     matrix = np.array([[3.0, 0.0], [4.0, 0.0], [0.0, 1.0]], np.float32)
-    value, gradient = jax.value_and_grad(largest_singular_value)(matrix)
+    value, gradient = jax.jit(jax.value_and_grad(largest_singular_value))(matrix)
     assert float(value) == pytest.approx(5)
     np.testing.assert_allclose(gradient, [[0.6, 0], [0.8, 0], [0, 0]], atol=1e-6)
     # A matrix whose singular values lie close together is the worst case: they come out a little too small.
     random = np.random.default_rng(0).normal(size=(40, 30)).astype(np.float32)
     exact = np.linalg.svd(random, compute_uv=False)[0]
-    assert 0.85 * exact < float(largest_singular_value(random)) <= exact * (1 + 1e-6)
+    assert 0.85 * exact < float(jax.jit(largest_singular_value)(random)) <= exact * (1 + 1e-6)
 
 
 def test_a_spectrally_normalised_decoder_has_kernels_of_size_one():
@@ -113,7 +111,7 @@ def test_a_spectrally_normalised_decoder_has_kernels_of_size_one():
         "b": np.zeros((2, 2)),
     }
     params = jax.tree.map(np.float32, params)
-    normal = spectrally_normalised(params)
+    normal = jax.jit(spectrally_normalised)(params)
     sizes = np.linalg.svd(np.asarray(normal["a"]["kernel"]).reshape(12, 5), compute_uv=False)
     assert (
         sizes[0] == pytest.approx(1, rel=0.05)
@@ -124,11 +122,15 @@ def test_a_spectrally_normalised_decoder_has_kernels_of_size_one():
     context, window = make_context(), make_window()
     plain, bounded = (objectives.reconstruction(context, spectral_norm=n) for n in (False, True))
     latents = latents_of(draw(1, BATCH, 8))
-    losses, head, _ = loss_of(bounded, latents, window)
-    same, _ = plain.loss(spectrally_normalised(head), None, latents, window, jax.random.key(0))
-    np.testing.assert_allclose(losses, same, rtol=1e-5)
+    head = helpers.random_params(bounded.init)
+
+    def losses(of, head):
+        return of.loss(head, None, latents, window, jax.random.key(0))[0]
+
+    pair = jax.jit(lambda head: (losses(bounded, head), losses(plain, spectrally_normalised(head))))(head)
+    np.testing.assert_allclose(*pair, rtol=1e-5)
     # The kernel's size does not count, so its gradient has no share along the kernel.
-    gradient = jax.grad(lambda h: bounded.loss(h, None, latents, window, jax.random.key(0))[0].sum())(head)
+    gradient = jax.jit(jax.grad(lambda head: losses(bounded, head).sum()))(head)
     along = np.sum(np.asarray(gradient["kernel"]) * head["kernel"])
     length = np.linalg.norm(gradient["kernel"]) * np.linalg.norm(head["kernel"])
     assert length > 0 and abs(along) < 1e-3 * length
@@ -162,7 +164,7 @@ def test_a_variational_autoencoder_against_numpy():
     objective, key = objectives.vae(make_context(), beta=20.0), jax.random.key(5)
     z, window = 2 * draw(1, BATCH, 8), make_window()
     head = helpers.random_params(objective.init)
-    losses, metrics = objective.loss(head, None, latents_of(z), window, key)
+    losses, metrics = jax.jit(lambda head: objective.loss(head, None, latents_of(z), window, key))(head)
     log_variance = dense(head["log_variance"], z[0])
     noisy = z[0] + np.sqrt(np.exp(log_variance)) * np.asarray(jax.random.normal(key, (BATCH, 8)))
     pixels = np.moveaxis(window.frames[:, :STACK, :, :, 0], 1, -1).reshape(BATCH, -1) / 255

@@ -122,7 +122,7 @@ def test_what_the_gradients_of_two_passes_are_added_up_over():
     for form, gate in (("summed", "sum"), ("summed", "pcgrad"), ("simultaneous", "pcgrad")):
         plan, optimizer = passes(mode, terms, form), make_optimizer(terms)
         state = make_init(make_encoder(), terms, mode, optimizer, plan=plan)(jax.random.key(0))
-        update = make_update(make_encoder(), terms, mode, optimizer, plan=plan, gate=gate)
+        update = jax.jit(make_update(make_encoder(), terms, mode, optimizer, plan=plan, gate=gate))
         hyper = Hyper(dict.fromkeys(terms, 1.0), RATES)
         moved[form, gate] = float(update(state, make_window(horizon=1), hyper)[0].params[RL]["w"])
     assert moved["summed", "sum"] == moved["summed", "pcgrad"] == pytest.approx(0.01, rel=1e-4)

@@ -41,7 +41,7 @@ def own_encoder():
 @pytest.fixture
 def few_held_out(monkeypatch):
     monkeypatch.setattr(heldout, "WINDOWS", 64)
-    monkeypatch.setattr(run, "DECODED", 64)
+    monkeypatch.setattr(run, "DECODED", 8)
 
 
 def trained(*arguments):
@@ -90,7 +90,10 @@ def test_an_environment_of_ones_own_is_trained(tmp_path, few_held_out):
     assert list((tmp_path / "run/figures").glob("*.png"))
 
 
-def test_an_own_objective_and_encoder_are_trained_as_they_say(tmp_path, few_held_out, own_encoder):
+def test_an_own_objective_and_encoder_are_trained_as_they_say(
+    tmp_path, monkeypatch, few_held_out, own_encoder
+):
+    monkeypatch.setattr(train, "draw", lambda *_: None)  # of its figures, the test above
     path = tmp_path / "run"
     own = [*command(own_objective, "runs/slow"), *command(own_encoder, "runs/two_layers")]
     trained(*own, "--preset=catch/joint", f"--out={path}")

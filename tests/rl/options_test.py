@@ -1,4 +1,4 @@
-"""srl_jax/rl: taus, Munchausen, copies of a batch, slow networks, and defects of public codes."""
+"""srl_jax/rl: taus, Munchausen, copies of a batch, slow networks, defects of public codes, sizes."""
 
 from functools import partial
 
@@ -16,7 +16,7 @@ from srl_jax.learning.update import periodic
 from srl_jax.rl import values
 from srl_jax.rl.losses import n_step
 from srl_jax.types import Context, Latents, TrainState, Window
-from tests.helpers import random_params
+from tests.helpers import count, random_params
 from tests.rl.rl_test import (
     ACTIONS,
     ATOMS,
@@ -287,3 +287,17 @@ def test_one_priority_a_batch_is_its_mean():
     np.testing.assert_array_equal(each[0], one[0])
     assert one[1]["td_error"].shape == (1,)
     np.testing.assert_allclose(one[1]["td_error"], each[1]["td_error"].mean(), rtol=1e-6)
+
+
+def test_head_of_the_thesis_has_its_size():
+    # On nature's 3,136 features, 6 actions: each stream 3136 * 512 + 512 = 1,606,144, then 512 * 306 + 306 =
+    # 156,978 and 512 * 51 + 51 = 26,163; all of it twice, since every weight has its sigma.
+    context = Context(3136, 6)
+    shapes = jax.eval_shape(rl.rainbow(context).objective.init, jax.random.key(0))
+    assert count(shapes) == 2 * (2 * 1_606_144 + 156_978 + 26_163)
+
+
+def test_normal_logits():
+    assert rl.normal_logits(np.linspace(-2, 2, 5), 1.0) == (-2.0, -0.5, 0.0, -0.5, -2.0)
+    assert rl.normal_logits(np.linspace(-2, 2, 5), 2.0) == (-0.5, -0.125, 0.0, -0.125, -0.5)
+    assert rl.normal_logits(np.array([1.0, 2.0, 3.0]), 1.0) == (0.0, -0.5, -2.0)  # 0 is not among them

@@ -13,7 +13,8 @@ import rlax
 from srl_jax import plugins, rl, specs
 from srl_jax.rl import heads, values
 from srl_jax.types import Context, Latents, Window
-from tests.helpers import all_zero, count, identical, random_params
+from tests.helpers import all_zero, make_encoder, random_params
+from tests.observed import of_algorithm
 
 pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:PendingDeprecationWarning")
 
@@ -332,31 +333,7 @@ def test_rainbow_is_the_row_with_its_parts(row, options, double):
     whole = rl.rainbow(CONTEXT, distributional=row == "c51", **options)
     row = rl.REGISTRY[row](CONTEXT, **options)
     assert facts(whole) == facts(row)
-    heads = [jax.jit(algorithm.objective.init)(jax.random.key(0)) for algorithm in (whole, row)]
-    assert identical(*heads)
-    slow_head = random_params(row.objective.init, 2)
-    online, slow, window = make_case()
-
-    @jax.jit
-    def run(head, online, slow):
-        arguments = head, slow_head, make_latents(online, slow), window, jax.random.key(0)
-        return [algorithm.objective.loss(*arguments) for algorithm in (whole, row)]
-
-    assert identical(*run(heads[0], online, slow))
-
-
-def test_head_of_the_thesis_has_its_size():
-    # On nature's 3,136 features, 6 actions: each stream 3136 * 512 + 512 = 1,606,144, then 512 * 306 + 306 =
-    # 156,978 and 512 * 51 + 51 = 26,163; all of it twice, since every weight has its sigma.
-    context = Context(3136, 6)
-    shapes = jax.eval_shape(rl.rainbow(context).objective.init, jax.random.key(0))
-    assert count(shapes) == 2 * (2 * 1_606_144 + 156_978 + 26_163)
-
-
-def test_normal_logits():
-    assert rl.normal_logits(np.linspace(-2, 2, 5), 1.0) == (-2.0, -0.5, 0.0, -0.5, -2.0)
-    assert rl.normal_logits(np.linspace(-2, 2, 5), 2.0) == (-0.5, -0.125, 0.0, -0.125, -0.5)
-    assert rl.normal_logits(np.array([1.0, 2.0, 3.0]), 1.0) == (0.0, -0.5, -2.0)  # 0 is not among them
+    assert of_algorithm(whole, make_encoder(FEATURES)) == of_algorithm(row, make_encoder(FEATURES))
 
 
 @pytest.mark.parametrize("row", rl.REGISTRY)
@@ -457,13 +434,11 @@ def test_values_are_learnt(kind, reward):
         latents = make_latents(online, slow)
         return algorithm.objective.loss(head, head, latents, window, jax.random.key(0))[0].mean()
 
-    @jax.jit
-    def update(head, state):
+    def update(_, learner):
+        head, state = learner
         steps, state = adam.update(jax.grad(mean_loss)(head), state)
         return optax.apply_updates(head, steps), state
 
-    state = adam.init(head)
-    for _ in range(200):
-        head, state = update(head, state)
-    q = np.asarray(algorithm.q_values(head, online[0]))[np.arange(BATCH), window.actions[:, 0]]
+    head, _ = jax.jit(lambda head: jax.lax.fori_loop(0, 200, update, (head, adam.init(head))))(head)
+    q = np.asarray(jax.jit(algorithm.q_values)(head, online[0]))[np.arange(BATCH), window.actions[:, 0]]
     np.testing.assert_allclose(q, reward, rtol=0.1)

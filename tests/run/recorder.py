@@ -193,8 +193,9 @@ class Watched:
         """Trains so many steps of all environments; returns the counts."""
         total = steps * self.num_envs
         self.config = Config(
-            game=self.game, rl="rainbow:hidden=1,atoms=2", encoder="tiny:features=1", frame_size=18,
-            num_envs=self.num_envs, buffer_size=self.slots * self.num_envs, batch_size=32, learn_start=32,
+            game=self.game, rl="dqn:hidden=1,prioritized=true,n_step=3", encoder="tiny:features=1",
+            frame_size=18, num_envs=self.num_envs, buffer_size=self.slots * self.num_envs,
+            batch_size=32, learn_start=32,
             updates_per_step=1 / self.num_envs, eps_final=1.0, steps=total, seed=seed, diagnostics=False,
             log_every=total, eval_every=total, eval_games=1, eval_max_steps=10,
         )  # fmt: skip
