@@ -41,7 +41,6 @@ def whole_run(seconds: float) -> dict[str, float]:
 
     config = config_of(NATURE)
     with tempfile.TemporaryDirectory() as out, Run([config], [Path(out)]) as run:
-        run.begin()
         while run.updates < WARM_UPDATES:
             run.step()
         first, start = run.env_steps, time.perf_counter()

@@ -31,7 +31,6 @@ class Loop:
 
     def __init__(self, preset: str):
         self._run = loop.Run([config_of(preset)], [Path()])
-        self._run.begin()
         while self._run.updates < WARM_UPDATES:
             self._run.step()
         self._forget()
