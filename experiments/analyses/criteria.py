@@ -3,6 +3,7 @@
 A campaign (--campaign) writes down before its runs what will decide, as data:
 
     game       of the runs
+    seeds      that decide, of each of which every arm has one run; others, as of a search, do not count
     measures   what is tested of each run, of `MEASURES`
     families   {family: {test: {arm: weight}}}: weighted sums of the means of arms, each with a two-sided
                t test of 0 (`srl_jax.statistics.contrast`); Holm's correction is over a family, for each
@@ -109,7 +110,10 @@ def read(campaign: Path) -> dict[str, Any]:
         tests = [weights for family in asked["families"].values() for weights in family.values()]
         for weights in tests:
             np.array([weights[arm] for arm in weights], np.float64)
-        if unknown or not tests or not isinstance(asked["game"], str):
+        seeds = asked["seeds"]
+        if unknown or not tests or not isinstance(asked["game"], str) or not isinstance(seeds, list):
+            raise ValueError
+        if len(set(seeds)) < len(seeds) or len(seeds) < 2 or not all(type(seed) is int for seed in seeds):
             raise ValueError
         if doses := asked.get("doses"):
             lines = [its for of_panel in doses["panels"].values() for its in of_panel.values()]
@@ -118,8 +122,8 @@ def read(campaign: Path) -> dict[str, Any]:
                 raise ValueError
     except (TypeError, KeyError, ValueError, AttributeError):
         wanted = (
-            f'"game", "measures" out of {", ".join(MEASURES)}, "families" of tests {{arm: weight}}, and '
-            f'perhaps "doses" above 0, see experiments/analyses/criteria.py'
+            f'"game", two "seeds" or more, "measures" out of {", ".join(MEASURES)}, "families" of tests '
+            f'{{arm: weight}}, and perhaps "doses" above 0, see experiments/analyses/criteria.py'
         )
         raise ConfigError(f"{path}: expected {wanted}") from None
     return asked
@@ -132,10 +136,13 @@ def runs_of(campaign: Path, asked: Mapping[str, Any]) -> dict[str, list[RunData]
     if doses := asked.get("doses"):
         named += [arm for lines in doses["panels"].values() for its in lines.values() for arm in its.values()]
         named.append(doses["reference"])
-    arms = {arm: there.get(arm, []) for arm in dict.fromkeys(named)}
+    wanted = asked["seeds"]
+    arms = {arm: [run for run in there.get(arm, []) if run.seed in wanted] for arm in dict.fromkeys(named)}
     for arm, runs in arms.items():
-        if len(runs) < 2 or not all(run.over and not run.failed for run in runs):
-            raise ConfigError(f"{campaign}: {arm} on {asked['game']} has not two runs or more that are over")
+        over = {run.seed for run in runs if run.over and not run.failed}
+        if missing := [seed for seed in wanted if seed not in over]:
+            seeds = ", ".join(map(str, missing))
+            raise ConfigError(f"{campaign}: {arm} on {asked['game']} has no run that is over of seed {seeds}")
     every = [run for runs in arms.values() for run in runs]
     collect.check_arms(every)
     collect.check_protocols(every)
