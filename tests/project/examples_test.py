@@ -90,10 +90,7 @@ def test_an_environment_of_ones_own_is_trained(tmp_path, few_held_out):
     assert list((tmp_path / "run/figures").glob("*.png"))
 
 
-def test_an_own_objective_and_encoder_are_trained_as_they_say(
-    tmp_path, monkeypatch, few_held_out, own_encoder
-):
-    monkeypatch.setattr(train, "draw", lambda *_: None)  # of its figures, the test above
+def test_an_own_objective_and_encoder_are_trained_as_they_say(tmp_path, few_held_out, own_encoder):
     path = tmp_path / "run"
     own = [*command(own_objective, "runs/slow"), *command(own_encoder, "runs/two_layers")]
     trained(*own, "--preset=catch/joint", f"--out={path}")
