@@ -9,7 +9,6 @@ The thesis' six are a table here; a figure of your own is a small JSON file:
 `preset` takes any preset, `flags` any flag of a run beside it, with a list where it may be repeated.
 """
 
-import os
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -22,6 +21,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.files.reading import SETTINGS, parse_json, read_bytes
 from srl_jax.specs import choices_text, near
 
+from .command_line import paths
 from .command_line.flags import MOVED
 from .presets import preset_values
 from .sweeping.plan import arm_of
@@ -153,7 +153,7 @@ def figures_named(text: str, presets: Sequence[str] = ()) -> list[Figure]:
     if text == "all":
         return list(FIGURES.values())
     if text.endswith(".json"):
-        return [read_figure(Path(os.path.expanduser(text)))]
+        return [read_figure(paths.given("figure", text))]
     names = text.split(",")
     for name in names:
         if name not in FIGURES:

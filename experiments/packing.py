@@ -12,7 +12,6 @@ import gzip
 import itertools
 import json
 import os
-import re
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
@@ -32,7 +31,7 @@ from srl_jax.run.ending import Ending
 
 from .command_line import flags as config_flags
 from .command_line import paths
-from .runs.run_data import RunData, check_rows, in_order, load_run, run_directories
+from .runs.run_data import RunData, check_rows, in_order, is_seed, load_run, run_directories
 
 CONFIGS = "configs.json"
 """[{"arm": its name, "config": the fields that its runs on a game share, "runs": [{"path": below the folder,
@@ -173,7 +172,7 @@ def pack(root: Path, folder: Path, *, stopped: bool = False) -> tuple[int, int, 
     ready = [run.over or (stopped and run.ended is not None) for run in found]
     whole = added([], itertools.compress(found, ready))
     above = root.parent if found[0].path == root else root
-    if any(re.fullmatch(r"seed\d+", run.path.relative_to(above).as_posix()) for run in found):
+    if any(is_seed(run.path.relative_to(above).as_posix()) for run in found):
         above = above.parent  # which has the arm's name
     runs = added(here, (run._replace(path=folder / run.path.relative_to(above)) for run in whole))
     if len(runs) > len(here):
@@ -285,7 +284,7 @@ def main(values: flags.FlagValues) -> None:
     for name in ("runs", "out"):
         if not values[name].value:
             raise ConfigError(f"--{name}: missing; name a directory")
-    runs, out = Path(os.path.expanduser(values.runs)), paths.check_place("out", values.out)
+    runs, out = paths.given("runs", values.runs), paths.check_place("out", values.out)
     if not runs.is_dir():
         raise ConfigError(f"--runs={values.runs}: no such directory")
     one, other = runs.resolve(), out.resolve()

@@ -10,7 +10,6 @@ better where arms spread alike. The effect is the one that would matter: with th
 says what p does.
 """
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -25,6 +24,7 @@ from srl_jax.files import display
 from srl_jax.specs import Info, choices_text
 
 from .command_line import flags as config_flags
+from .command_line import paths
 from .runs import collect
 
 PUBLISHED = "published"
@@ -185,7 +185,7 @@ def report(values: flags.FlagValues) -> list[str]:
         raise ConfigError(f"--arm={arms[0]}: give it twice, for the two arms, or not at all")
     game = envs.canonical(values["game"].value) if values["game"].value else None
     if source != PUBLISHED:
-        found = of_runs(Path(os.path.expanduser(source)), game, force=values["force"].value)
+        found = of_runs(paths.given("from", source), game, force=values["force"].value)
     elif game and (spreads := of_published(game)):
         found = {game: spreads}
     else:

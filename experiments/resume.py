@@ -6,7 +6,6 @@ ended if it was trained with --keep_replay; --stop_at_return; --keep_replay; --k
 """
 
 import os
-import re
 import sys
 from pathlib import Path
 
@@ -17,7 +16,7 @@ from srl_jax.files.rundir import put_back
 from . import train
 from .command_line import flags as config_flags
 from .command_line import help
-from .runs.run_data import natural
+from .runs.run_data import is_seed, natural
 from .sweeping.manifest import FILE
 
 
@@ -38,7 +37,7 @@ def command_line(run: str) -> list[str]:
     if (path / FILE).is_file():
         raise ConfigError(f"{run}: a sweep, which srl-jax sweep --out={run} resumes")
     there = (file.parent.name for file in path.glob("seed*/config.json"))
-    seeds = sorted((name for name in there if re.fullmatch(r"seed\d+", name)), key=natural)
+    seeds = sorted(filter(is_seed, there), key=natural)
     if not seeds:
         raise ConfigError(f"{run}: not a run directory (no config.json)")
     if root := next((root for root in path.absolute().parents[:2] if (root / FILE).is_file()), None):

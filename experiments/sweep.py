@@ -12,7 +12,6 @@ Bad input ends with one line on stderr and exit status 2 before anything is writ
 runs are complete, 1 if one failed, 3 if the disk is full, 128 + n after signal n.
 """
 
-import os
 from pathlib import Path
 
 from absl import flags
@@ -88,7 +87,7 @@ def main(values: flags.FlagValues) -> int:
     """The entry point; returns the exit status."""
     if not values.out:
         raise ConfigError("--out: missing; name a directory for the sweep, --out=runs/NAME")
-    root = Path(os.path.expanduser(values.out)) if values.status else paths.check_place("out", values.out)
+    root = paths.given("out", values.out) if values.status else paths.check_place("out", values.out)
     if values.status:
         for name in ("presets", "games", "seeds", "grid", "dry_run", *options.given_flags(values)):
             if values[name].present:

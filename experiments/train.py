@@ -9,7 +9,6 @@ import contextlib
 import dataclasses
 import functools
 import os
-import re
 import signal
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -41,6 +40,7 @@ from .command_line import flags as config_flags
 from .command_line import paths, runtime
 from .command_line.stopping import signals
 from .packing import CONFIGS
+from .runs.run_data import is_seed
 
 
 def define_flags(values: flags.FlagValues) -> None:
@@ -125,7 +125,7 @@ def _why_not(path: Path, config: Config, overwrite: bool, resume: bool, seeds: b
         return "a link, so --overwrite does not delete it; name what it leads to"
     if not (single or several):
         return "not a run directory, so --overwrite does not delete it"
-    others = [e.name for e in path.iterdir() if not re.fullmatch(rf"seed\d+|{LOCK}", e.name)]
+    others = [e.name for e in path.iterdir() if not (is_seed(e.name) or e.name == LOCK)]
     if not single and others:
         return (
             f"{min(others)} lies beside the runs of seeds, so --overwrite does not delete them; move it away"

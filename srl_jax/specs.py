@@ -139,6 +139,11 @@ def parse_value(text: str, kind: type) -> bool | int | float | str:
     return number
 
 
+def linear(start: float, end: float, steps: int, now: int) -> float:
+    """The linear schedule from start to end over so many env steps, constant afterwards."""
+    return end if now >= steps else start + (end - start) * (now / steps)
+
+
 class Weight(float):
     """The weight of an objective that is more than one number; as a float it is that of the first env step.
 
@@ -165,9 +170,7 @@ class Weight(float):
 
     def at(self, env_steps: int) -> float:
         """The number after so many env steps."""
-        if env_steps >= self.steps:
-            return self.final
-        return float(self) + (self.final - float(self)) * env_steps / self.steps
+        return linear(float(self), self.final, self.steps, env_steps)
 
     def __eq__(self, other: object) -> bool:
         return repr(self) == repr(other)

@@ -10,7 +10,7 @@ A campaign (--campaign) writes down before its runs what will decide, as data:
                measure on its own. An arm less its baseline has weights 1 and -1.
     doses      optional: {"across": what varies, "reference": an arm, "panels": {panel: {line: {dose: arm}}}},
                drawn over the logarithm of the dose; of each line it is said how often which dose is best,
-               when the runs of each arm are drawn again with replacement
+               when the runs of each arm are drawn again with replacement; it needs the measure area
 
 `--out` writes DIRECTORY/tests.json and .md, and doses.png where there are doses. Imports no jax.
 """
@@ -31,6 +31,7 @@ from srl_jax.files.reading import read_json
 
 from .. import packing
 from ..command_line import flags as config_flags
+from ..command_line import paths
 from ..drawing import plots
 from ..runs import collect
 from ..runs.json_values import limits, plain
@@ -69,29 +70,31 @@ def _drift(run: RunData) -> float:
 MEASURES: dict[str, Callable[[Arms], dict[str, np.ndarray]]] = {"area": areas, "drift": drifts}
 
 
-def analyse(campaign: Path) -> dict[str, Any]:
+def analyse(campaign: Path, asked: Mapping[str, Any]) -> dict[str, Any]:
     """The tests of a campaign, as JSON values.
+
+    Args:
+        campaign: the folder.
+        asked: its criteria, see `read`.
 
     Returns:
         {"arms": {measure: {arm: its mean and interval}}, "tests": {measure: {family: {test: the weighted
         sum, its interval, "p", "holm": p after the correction}}}, "best": {panel: {line: {dose: share}}}}.
 
     Raises:
-        ConfigError: the criteria are none, or a run is not there, is not over, or cannot be compared.
+        ConfigError: a run is not there, is not over, or cannot be compared.
     """
-    asked = read(campaign)
     arms = runs_of(campaign, asked)
     found: dict[str, Any] = {"arms": {}, "tests": {}}
-    for measure in asked["measures"]:
-        values = MEASURES[measure](arms)
+    measured = {measure: MEASURES[measure](arms) for measure in asked["measures"]}
+    for measure, values in measured.items():
         found["arms"][measure] = {arm: limits(statistics.mean_interval(x)) for arm, x in values.items()}
         found["tests"][measure] = {
             family: tested(tests, values) for family, tests in asked["families"].items()
         }
     if doses := asked.get("doses"):
-        values = areas(arms)
         found["best"] = {
-            panel: {line: best(its, values) for line, its in lines.items()}
+            panel: {line: best(its, measured["area"]) for line, its in lines.items()}
             for panel, lines in doses["panels"].items()
         }
     return found
@@ -109,7 +112,7 @@ def read(campaign: Path) -> dict[str, Any]:
         unknown = set(asked["measures"]) - MEASURES.keys()
         tests = [weights for family in asked["families"].values() for weights in family.values()]
         for weights in tests:
-            np.array([weights[arm] for arm in weights], np.float64)
+            np.array([*weights.values()], np.float64)
         seeds = asked["seeds"]
         if unknown or not tests or not isinstance(asked["game"], str) or not isinstance(seeds, list):
             raise ValueError
@@ -117,8 +120,8 @@ def read(campaign: Path) -> dict[str, Any]:
             raise ValueError
         if doses := asked.get("doses"):
             lines = [its for of_panel in doses["panels"].values() for its in of_panel.values()]
-            doses["across"], doses["reference"]
-            if not all(float(dose) > 0 for its in lines for dose in its):
+            named = doses.keys() >= {"across", "reference"} and "area" in asked["measures"]
+            if not named or not all(float(dose) > 0 for its in lines for dose in its):
                 raise ValueError
     except (TypeError, KeyError, ValueError, AttributeError):
         wanted = (
@@ -179,14 +182,10 @@ def tables(found: Mapping[str, Any]) -> str:
     parts = []
     for measure, families in found["tests"].items():
         for family, tests in families.items():
-            body = [
-                [name, _interval(row, "+.3f", bold=row["holm"] is not None and row["holm"] <= LEVEL)]
-                + ["-" if row[key] is None else f"{row[key]:.4f}" for key in ("p", "holm")]
-                for name, row in tests.items()
-            ]
+            body = [[name, *_cells(row)] for name, row in tests.items()]
             title = f"**{family}** ({measure})"
             parts.append(f"{title}\n\n{output.markdown(['test', 'found', 'p', 'after Holm'], body)}")
-        arms = [[arm, _interval(row, ".3f")] for arm, row in found["arms"][measure].items()]
+        arms = [[arm, output.interval(row, ".3f")] for arm, row in found["arms"][measure].items()]
         parts.append(f"**Arms** ({measure})\n\n{output.markdown(['arm', 'mean'], arms)}")
     for panel, lines in found.get("best", {}).items():
         head = ["best of", *next(iter(lines.values()))]
@@ -198,26 +197,31 @@ def tables(found: Mapping[str, Any]) -> str:
     return "\n\n".join(parts)
 
 
-def _interval(row: Mapping[str, Any], form: str, bold: bool = False) -> str:
-    low, high = ("-" if row[key] is None else format(row[key], form) for key in ("low", "high"))
-    text = f"{row['mean']:{form}} [{low}, {high}]"
-    return f"**{text}**" if bold else text
+def _cells(row: Mapping[str, Any]) -> list[str]:
+    text = output.interval(row, "+.3f")
+    told = row["holm"] is not None and row["holm"] <= LEVEL
+    return [f"**{text}**" if told else text] + [
+        "-" if row[key] is None else f"{row[key]:.4f}" for key in ("p", "holm")
+    ]
 
 
-def draw(campaign: Path, path: Path) -> Path:
-    """Draws the mean area of each dose, with the reference as a horizontal line."""
-    asked = read(campaign)
-    doses, values = asked["doses"], areas(runs_of(campaign, asked))
-    reference = doses["reference"]
-    panels = []
+def draw(asked: Mapping[str, Any], found: Mapping[str, Any], path: Path) -> Path:
+    """Draws the mean area of each dose, with the reference as a horizontal line.
+
+    Args:
+        asked: criteria that ask for doses.
+        found: of `analyse`.
+        path: of the PNG file.
+    """
+    doses, areas = asked["doses"], found["arms"]["area"]
+    reference, panels = doses["reference"], []
     for title, lines in doses["panels"].items():
         drawn = []
         for name, its in lines.items():
-            found = [statistics.mean_interval(values[arm]) for arm in its.values()]
             at = [float(np.log10(float(dose))) for dose in its]
-            curve = plots.Curve(at, *zip(*((x.point, x.low, x.high) for x in found), strict=True))
-            drawn.append(plots.Line(name, curve, min(len(values[arm]) for arm in its.values())))
-        level = plots.Level(reference, float(values[reference].mean()))
+            band = ([areas[arm][key] for arm in its.values()] for key in ("mean", "low", "high"))
+            drawn.append(plots.Line(name, plots.Curve(at, *band), len(asked["seeds"])))
+        level = plots.Level(reference, areas[reference]["mean"])
         ticks = {float(np.log10(float(dose))): dose for its in lines.values() for dose in its}
         panels.append(plots.Panel("", drawn, [level], title=title, across=doses["across"], ticks=ticks))
     return plots.draw_panels(panels, path, "", label="area under the learning curve")
@@ -231,15 +235,15 @@ def define_flags(values: flags.FlagValues) -> None:
 
 def main(values: flags.FlagValues) -> None:
     """The entry point."""
-    campaign = Path(values.campaign)
+    campaign = paths.given("campaign", values.campaign)
     asked = read(campaign)
     out = output.place(values.out, drawn="doses" in asked)
-    found = analyse(campaign)
+    found = analyse(campaign, asked)
     display.result(tables(found))
     if out is not None:
         output.write(out, {"tests.json": json.dumps(found, indent=1), "tests.md": tables(found)})
         if "doses" in asked:
-            draw(campaign, out / "doses.png")
+            draw(asked, found, out / "doses.png")
 
 
 if __name__ == "__main__":

@@ -132,18 +132,15 @@ def tables(found: Mapping[str, Any]) -> str:
 
 
 def _line(arm: str, row: Mapping[str, Any], cost: Mapping[str, float]) -> list[str]:
-    def interval(x: Mapping[str, float], form: str) -> str:
-        return f"{x['mean']:{form}} [{x['low']:{form}}, {x['high']:{form}}]"
-
     def number(x: float | None, form: str) -> str:
         return "-" if x is None else format(x, form)
 
     objective = _title(arm)
-    difference = interval(row["difference"], "+.2f") if "difference" in row else "-"
+    difference = output.interval(row["difference"], "+.2f") if "difference" in row else "-"
     steps = number(row["steps to target"], ",.0f")
     return [
         objective,
-        interval(row["area"], ".2f"),
+        output.interval(row["area"], ".2f"),
         f"**{difference}**" if row.get("significant") else difference,
         number(row.get("p"), ".3f"),
         f"{row['at the end']:.2f}",

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from absl import flags
 
@@ -47,6 +48,12 @@ def write(out: Path, texts: Mapping[str, str]) -> None:
         out.mkdir(parents=True, exist_ok=True)
         for name, text in texts.items():
             replace_text(out / name, text + "\n")
+
+
+def interval(values: Mapping[str, Any], form: str) -> str:
+    """The text of an interval's mean and limits, of `json_values.limits`; - for a limit that there is not."""
+    low, high = ("-" if values[key] is None else format(values[key], form) for key in ("low", "high"))
+    return f"{values['mean']:{form}} [{low}, {high}]"
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:

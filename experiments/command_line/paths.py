@@ -21,7 +21,7 @@ def given(flag: str, text: str) -> Path:
         ConfigError: it is empty, as of a variable of the shell that is not set.
     """
     if not text:
-        raise ConfigError(f"--{flag}=: is empty; name a directory")
+        raise ConfigError(f"--{flag}: is empty; name a path")
     return Path(os.path.expanduser(text))
 
 

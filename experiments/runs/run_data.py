@@ -65,10 +65,15 @@ def in_order(runs: Iterable[RunData]) -> list[RunData]:
     return sorted(runs, key=lambda run: (run.game, natural(run.arm), run.seed))
 
 
+def is_seed(name: str) -> bool:
+    """Whether a run directory of this name, seedN, has its arm's name in its parent's."""
+    return bool(re.fullmatch(r"seed\d+", name))
+
+
 def arm_name(path: Path) -> str:
     """The arm of a run directory: its parent's name if it is called seedN, else its own without _seedN."""
     path = Path(os.path.abspath(path))  # of ".", too
-    if re.fullmatch(r"seed\d+", path.name):
+    if is_seed(path.name):
         return path.parent.name
     return re.sub(r"_seed\d+$", "", path.name)
 

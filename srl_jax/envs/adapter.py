@@ -80,7 +80,7 @@ class Adapter(FrameVectorEnv):
         try:
             self._envs = [make_one() for _ in range(num_envs)]
         except Exception as error:
-            what = " ".join(f"{type(error).__name__}: {error}".split())
+            what = _line(error)
             if isinstance(error, ModuleNotFoundError):
                 what += " A file is found in the working directory, or by --import=PATH/FILE.py"
             raise ConfigError(f"cannot be made: {what}") from error
@@ -222,7 +222,11 @@ class Adapter(FrameVectorEnv):
             try:
                 env.close()
             except Exception as error:
-                display.say(f"an environment was not closed: {type(error).__name__}: {error}")
+                display.say(f"an environment was not closed: {_line(error)}")
+
+
+def _line(error: Exception) -> str:
+    return " ".join(f"{type(error).__name__}: {error}".split())
 
 
 def _attribute(env: gymnasium.Env, name: str, default: Any) -> Any:

@@ -156,7 +156,7 @@ class Replay:
         streams = self._streams if streams is None else np.asarray(streams)
         if streams.size and streams.dtype.kind not in "iu":
             raise ValueError(f"streams must be indices, not {streams.dtype}")
-        streams = streams.astype(np.int64)
+        streams = streams.astype(np.int64, copy=False)
         if len(set(streams.ravel().tolist()) & set(range(self.num_streams))) != streams.size:
             raise ValueError(f"streams must be distinct and below {self.num_streams}: {streams}")
         frames = _check("frames", frames, (len(streams), *self.frame_shape), np.uint8)

@@ -220,11 +220,11 @@ def n_step(
     Raises:
         ValueError: n, an int, is not in 1..K.
     """
-    if isinstance(n, int) and not 1 <= n <= rewards.shape[-1]:
-        raise ValueError(f"n must be in 1..{rewards.shape[-1]}, the window's steps, not {n}")
+    steps = rewards.shape[-1]
     if not isinstance(n, int):  # what lies n steps ahead or more counts as behind the episode's end
-        steps = rewards.shape[-1]
         valid, n = valid * (jnp.arange(steps) < n[..., None]), steps
+    elif not 1 <= n <= steps:
+        raise ValueError(f"n must be in 1..{steps}, the window's steps, not {n}")
     r_t = jnp.zeros(rewards.shape[:-1], rewards.dtype)
     discount_t = jnp.ones(rewards.shape[:-1], discounts.dtype)
     for k in range(n):

@@ -75,11 +75,6 @@ def make_env(config: Config, purpose: str, num_envs: int, *, seed: int | None = 
     )
 
 
-def linear(start: float, end: float, steps: int, now: int) -> float:
-    """The linear schedule from start to end over so many env steps, constant afterwards."""
-    return end if now >= steps else start + (end - start) * now / steps
-
-
 def random_policy(num_actions: int, rng: np.random.Generator) -> Policy:
     """The policy that draws actions uniformly from `rng`; step and epsilon do not matter to it."""
 

@@ -10,8 +10,7 @@ from srl_jax.config import Config
 from srl_jax.learning import annealing
 from srl_jax.learning.modes import MODES
 from srl_jax.learning.update import Hyper
-from srl_jax.run.actor import linear
-from srl_jax.specs import Weight
+from srl_jax.specs import Weight, linear
 from srl_jax.types import Objective
 
 

@@ -10,7 +10,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from srl_jax.run.actor import FrameStack, linear, random_policy, seed_for, yielding_threads
+from srl_jax.run.actor import FrameStack, random_policy, seed_for, yielding_threads
+from srl_jax.specs import linear
 
 STEP, BEGIN = "step", "begin"
 
