@@ -16,6 +16,7 @@ import numpy as np
 
 from srl_jax.config import INFOS, Config
 from srl_jax.files import checkpoint
+from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.learning.agent import Agent, Seeds, make_agent, over_seeds
 from srl_jax.run import ending
 from srl_jax.run.ending import Ending
@@ -303,6 +304,11 @@ def write_checkpoint(
     kept = {name: params[name] for name in only or params}
     counts = {"num_actions": NUM_ACTIONS, "env_steps": env_steps, "updates": 1}
     return checkpoint.save(run, kept, config, frame_shape=frame, folder=folder, **counts).path
+
+
+def rows_of(run: Path) -> list[dict]:
+    """A run's rows, less their times, which no other run has."""
+    return [strip_wall(row) for row in read_metrics(run / "metrics.jsonl")]
 
 
 def whole(path: Path) -> checkpoint.Manifest:

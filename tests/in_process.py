@@ -48,17 +48,18 @@ class Loop(types.ModuleType):
         )
 
 
-def parse(arguments):
+def parse(module, *arguments, positional=None):
+    """The flags of a program, as these arguments set them."""
     values = flags.FlagValues()
-    train.define_flags(values)
-    config_flags.parse(["train", *arguments], values)
+    module.define_flags(values)
+    config_flags.parse([module.__name__, *map(str, arguments)], values, positional)
     return values
 
 
 def train_in_process(*arguments):
     """What the entry point does, in this process and with flags of its own."""
     try:
-        return train.train(parse(arguments))
+        return train.train(parse(train, *arguments))
     except ConfigError as error:
         config_flags.fail(error)
 

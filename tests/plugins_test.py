@@ -9,10 +9,8 @@ import subprocess
 import sys
 
 import pytest
-from absl import flags
 
 from experiments import evaluate, train
-from experiments.command_line import flags as config_flags
 from srl_jax import objectives, plugins
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
@@ -20,6 +18,7 @@ from srl_jax.files.checkpoint import read_manifest
 from srl_jax.files.metrics import read_metrics
 from srl_jax.plugins import Registry, load, located
 from srl_jax.specs import parse
+from tests import in_process
 from tests.helpers import SMALL, last_of_each, write_run
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
@@ -235,15 +234,8 @@ def fresh(monkeypatch):
     forget()
 
 
-def _called(main, define_flags, arguments):
-    values = flags.FlagValues()
-    define_flags(values)
-    config_flags.parse(["program", *arguments], values)
-    return main(values)
-
-
 def _train(*arguments):
-    return _called(train.train, train.define_flags, arguments)
+    return train.train(in_process.parse(train, *arguments))
 
 
 def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path, fresh, monkeypatch, capsys):
@@ -259,7 +251,7 @@ def test_an_objective_in_a_file_is_trained_evaluated_and_gone_on_with(tmp_path, 
 
     # It moved: what is typed beside a program counts.
     def evaluated(*arguments):
-        _called(evaluate.main, evaluate.define_flags, [f"--run={run}", "--games=2", *arguments])
+        evaluate.main(in_process.parse(evaluate, f"--run={run}", "--games=2", *arguments))
         return json.loads(capsys.readouterr().out)
 
     fresh()

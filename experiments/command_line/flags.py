@@ -101,8 +101,8 @@ def kinds(values: flags.FlagValues) -> tuple[Callable[..., Any], ...]:
 
 def define_config_flags(values: flags.FlagValues = flags.FLAGS) -> None:
     """Defines a flag for every field of Config, --preset and --config."""
-    for name, info in INFOS.items():
-        define(info.flag or name, info, getattr(Config(), name), values)
+    for name, default in vars(Config()).items():
+        define(INFOS[name].flag or name, INFOS[name], default, values)
     flags.DEFINE_string(
         "preset",
         None,

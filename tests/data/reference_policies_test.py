@@ -4,15 +4,14 @@ import csv
 
 import numpy as np
 import pytest
-from absl import flags
 
 from experiments import reference_policies as played
-from experiments.command_line import flags as config_flags
 from experiments.runs.collect import differs
 from srl_jax.config import Config
 from srl_jax.data import POLICIES, published, reference_policies
 from srl_jax.envs import ATARI_57
 from srl_jax.errors import ConfigError
+from tests.in_process import parse
 
 CATCH = ("Catch", "CatchDistractor")
 THESIS = ("Breakout", "Enduro", "MsPacman", "Pong", "Qbert", "Seaquest", "SpaceInvaders")
@@ -88,10 +87,7 @@ def test_other_games_have_the_published_score_of_a_random_policy():
 
 
 def _run(*arguments):
-    values = flags.FlagValues()
-    played.define_flags(values)
-    config_flags.parse(["reference_policies", *arguments], values)
-    return played.run(values)
+    return played.run(parse(played, *arguments))
 
 
 def test_the_same_games_at_any_frame_size():

@@ -106,9 +106,10 @@ def test_a_same_decoder_is_the_transposed_encoder():
     rng = np.random.default_rng(0)
     kernel = rng.normal(size=(4, 4, 3, 2)).astype(np.float32)
     x, y = (rng.normal(size=shape).astype(np.float32) for shape in ((1, 9, 9, 3), (1, 5, 5, 2)))
-    conv = Conv(2, 4, 2, padding="SAME").apply({"params": {"kernel": kernel, "bias": np.zeros(2)}}, x)
+    params = {"kernel": kernel, "bias": np.zeros(2)}
+    conv = jax.jit(Conv(2, 4, 2, padding="SAME").apply)({"params": params}, x)
     layer = ConvTranspose(3, 4, 2, (9, 9), padding=padding)
-    back = layer.apply({"params": {"kernel": kernel.transpose(0, 1, 3, 2), "bias": np.zeros(3)}}, y)
+    back = jax.jit(layer.apply)({"params": {"kernel": kernel.transpose(0, 1, 3, 2), "bias": np.zeros(3)}}, y)
     assert conv.shape == y.shape and back.shape == x.shape
     assert float(jnp.sum(conv * y)) == pytest.approx(float(jnp.sum(x * back)), rel=1e-4)
 

@@ -120,7 +120,7 @@ def test_every_start_can_be_won(ball):
             for paddle in (24, 42, 59)
         ]
     )
-    env = envs.make(f"catch:ball={ball}", num_envs=len(starts), seed=0)
+    env = envs.make(f"catch:ball={ball}", num_envs=len(starts), seed=0, frame_size=42)
     env._frames = lambda: None
     put(env, *starts.T)
     caught = np.zeros(len(starts), bool)

@@ -3,18 +3,18 @@
 import contextlib
 import json
 import types
+from functools import partial
 
 import pytest
-from absl import flags
 
 from experiments.benchmarks import bench, rows
 from experiments.benchmarks.bench import CheckFailed
 from experiments.benchmarks.rows import GROUPS, Row
 from experiments.benchmarks.worker import Worker, WorkerError
-from experiments.command_line import flags as config_flags
 from srl_jax import objectives
 from srl_jax.errors import ConfigError
 from tests.helpers import SMALL
+from tests.in_process import parse
 
 SIDE = """
 import os
@@ -200,11 +200,7 @@ def test_a_projected_run_has_the_evaluations_of_a_whole_one(tiny):
 # The command line
 
 
-def _values(*arguments):
-    values = flags.FlagValues()
-    bench.define_flags(values)
-    config_flags.parse(["bench", *arguments], values)
-    return values
+_values = partial(parse, bench)
 
 
 def test_rows_are_chosen_in_the_tables_order():

@@ -3,16 +3,15 @@
 import json
 
 import pytest
-from absl import flags
 
 from experiments import compare, packing
-from experiments.command_line import flags as config_flags
 from experiments.drawing import plots
 from experiments.drawing.colours import styles
 from experiments.runs import collect
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from tests.helpers import NOT_FINITE, write_run
+from tests.in_process import parse
 
 
 @pytest.fixture(scope="module")
@@ -35,10 +34,7 @@ def runs(tmp_path_factory):
 
 
 def _compare(*arguments):
-    values = flags.FlagValues()
-    compare.define_flags(values)
-    config_flags.parse(["compare", *map(str, arguments)], values, "runs")
-    compare.compare(values)
+    compare.compare(parse(compare, *arguments, positional="runs"))
 
 
 @pytest.fixture

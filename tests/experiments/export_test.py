@@ -8,14 +8,13 @@ import zipfile
 import jax
 import numpy as np
 import pytest
-from absl import flags
 
 import srl_jax
 from experiments import export
-from experiments.command_line import flags as config_flags
 from srl_jax import encoders, plugins, specs
 from srl_jax.errors import ConfigError, SaveError
 from tests.helpers import JOINT, fill, identical, write_checkpoint
+from tests.in_process import parse
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +30,7 @@ def exported():
     """Runs the command, whose arguments it takes."""
 
     def call(*arguments):
-        values = flags.FlagValues()
-        export.define_flags(values)
-        config_flags.parse(["export", *map(str, arguments)], values, positional="run")
-        export.main(values)
+        export.main(parse(export, *arguments, positional="run"))
 
     return call
 

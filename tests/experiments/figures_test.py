@@ -4,11 +4,9 @@ import json
 
 import numpy as np
 import pytest
-from absl import flags
 
 from experiments import figures
 from experiments.arms import FIGURES, Figure, FigureArm
-from experiments.command_line import flags as config_flags
 from experiments.drawing import plots
 from experiments.reporting.numbers import arms_of, compare, table
 from experiments.runs import collect
@@ -17,6 +15,7 @@ from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from tests.helpers import NOT_FINITE, write_run
+from tests.in_process import parse
 
 FIGURE = Figure("mine", "Mine", "?", (FigureArm("a", "catch/rl_only"), FigureArm("b", "catch/joint")))
 GONE = "Catch, {}: {} of {} seeds left out: not there (seed {})\n"
@@ -235,10 +234,7 @@ def test_all_figures_share_their_runs():
 
 
 def _run(*arguments):
-    values = flags.FlagValues()
-    figures.define_flags(values)
-    config_flags.parse(["figures", *arguments], values)
-    return figures.run(values)
+    return figures.run(parse(figures, *arguments))
 
 
 @pytest.mark.parametrize(

@@ -6,10 +6,8 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from absl import flags
 
 from experiments import figures, packing, report
-from experiments.command_line import flags as config_flags
 from experiments.runs import collect
 from experiments.sweeping import states
 from srl_jax.config import Config
@@ -17,6 +15,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.run.ending import Ending
 from srl_jax.training import completed
 from tests.helpers import NOT_FINITE, write_run
+from tests.in_process import parse
 
 ROW = {
     "kind": "eval", "env_steps": 300, "updates": 9007199254740993, "wall_s": 0.1,
@@ -215,11 +214,8 @@ def test_a_row_that_has_a_key_of_packing_is_refused(root, tmp_path):
 
 
 def _figures(out, *more):
-    values = flags.FlagValues()
-    figures.define_flags(values)
     given = ["--figure=6.3", "--games=Catch", "--seeds=2", f"--out={out}", *more]
-    config_flags.parse(["figures", *given], values)
-    return figures.run(values)
+    return figures.run(parse(figures, *given))
 
 
 def test_a_figure_and_a_page_are_the_same_from_packed_runs(root, tmp_path):
@@ -229,11 +225,9 @@ def test_a_figure_and_a_page_are_the_same_from_packed_runs(root, tmp_path):
         assert _figures(out, "--redraw") == 0
     pages = []
     for out in (root, tmp_path / "packed/runs"):
-        values = flags.FlagValues()
-        report.define_flags(values)
         page = tmp_path / f"page_of_{out.parent.name}/page.html"
-        config_flags.parse(["report", f"--runs={out}", f"--out={page}", "--force"], values)
-        pages.append(report.report(values).read_bytes())
+        page = report.report(parse(report, f"--runs={out}", f"--out={page}", "--force"))
+        pages.append(page.read_bytes())
     for name in ("6.3.json", "6.3.png"):
         drawn = [(out / "figures" / name).read_bytes() for out in (root, tmp_path / "packed/runs")]
         assert drawn[0] == drawn[1]
@@ -253,10 +247,7 @@ def test_packed_runs_are_not_run_again_in_their_place_nor_counted_twice(root, tm
 
 def test_the_command_line(root, tmp_path, capsys):
     def main(*arguments):
-        values = flags.FlagValues()
-        packing.define_flags(values)
-        config_flags.parse(["packing", *map(str, arguments)], values, "runs")
-        packing.main(values)
+        packing.main(parse(packing, *arguments, positional="runs"))
 
     main(root, f"--out={tmp_path / 'out'}")
     main(tmp_path / "out", f"--out={tmp_path / 'again'}", "--unpack")

@@ -13,15 +13,13 @@ from experiments.presets import PRESETS, preset_values
 from experiments.protocols import PROTOCOLS, PROTOCOLS_HELP
 from srl_jax.config import Config
 from srl_jax.specs import value_text
+from tests.in_process import parse
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "atari100k.md"
 
 
 def config_of(*arguments):
-    values = flags.FlagValues()
-    train.define_flags(values)
-    config_flags.parse(["train", *arguments], values)
-    return config_flags.config_from_flags(values)
+    return config_flags.config_from_flags(parse(train, *arguments))
 
 
 def test_the_table_of_the_page_is_the_code():

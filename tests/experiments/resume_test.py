@@ -15,10 +15,9 @@ from experiments import resume, train
 from srl_jax.config import INFOS, SOURCES, Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint, rundir
-from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.files.resuming import MAY_CHANGE
 from srl_jax.run import ending
-from tests.helpers import SMALL
+from tests.helpers import SMALL, rows_of
 from tests.in_process import CATCH, ROOT, checkpoint_of, refused, train_in_process
 
 JOINT = ["--game=Catch", "--mode=joint", "--objective=reconstruction"]
@@ -294,6 +293,5 @@ def test_a_process_that_is_told_to_end_goes_on_as_if_it_had_not(tmp_path, capsys
     whole = tmp_path / "whole"
     whole.mkdir()
     loop.train(Config.load(out), whole, progress=False)
-    rows = [[strip_wall(row) for row in read_metrics(path / "metrics.jsonl")] for path in (out, whole)]
-    assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 600
+    assert rows_of(out) == rows_of(whole) and rows_of(out)[-1]["env_steps"] == 600
     assert checkpoint.read_manifest(out).files == checkpoint.read_manifest(whole).files

@@ -5,7 +5,6 @@ from functools import partial
 from types import SimpleNamespace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -121,10 +120,11 @@ def test_a_share_of_1_leaves_the_encoder(states):
 
 def test_several_seeds_are_reset_as_each_alone(states):
     before, fresh = (state._replace(key=np.int32(0)) for state in states)
-    stacked = partial(jax.tree.map, lambda *x: jnp.stack(x))
+    stacked = partial(jax.tree.map, lambda *x: np.stack(x))
     both = stacked(before, fresh), stacked(fresh, before)
-    alone = [reset(before, fresh, "all", 0.3), reset(fresh, before, "all", 0.3)]
-    together = reset(*both, "all", 0.3)
+    reset_all = jax.jit(partial(reset, kind="all", shrink=0.3))
+    alone = [reset_all(before, fresh), reset_all(fresh, before)]
+    together = jax.device_get(reset_all(*both))
     for i, state in enumerate(alone):
         assert identical(jax.tree.map(lambda x: x[i], together), state)  # noqa: B023
 

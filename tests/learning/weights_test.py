@@ -12,7 +12,6 @@ from srl_jax import checks, objectives, specs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
-from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.learning import modes, weights
 from srl_jax.learning.agent import make_agent
 from srl_jax.learning.modes import MODES
@@ -23,7 +22,7 @@ from srl_jax.run import loop, saving
 from srl_jax.run.schedules import Schedules
 from srl_jax.specs import Weight, parse_weight
 from srl_jax.types import Objective
-from tests.helpers import SMALL, make_context, make_encoder, make_window, random_state, stop_after
+from tests.helpers import SMALL, make_context, make_encoder, make_window, random_state, rows_of, stop_after
 
 
 @pytest.mark.parametrize(
@@ -181,12 +180,8 @@ RUN = Config(
 )  # fmt: skip
 
 
-def rows(path):
-    return [strip_wall(row) for row in read_metrics(path / "metrics.jsonl")]
-
-
 def used(path):
-    return [row["weight/inverse"] for row in rows(path) if "weight/inverse" in row]
+    return [row["weight/inverse"] for row in rows_of(path) if "weight/inverse" in row]
 
 
 @pytest.fixture(scope="module")
@@ -205,7 +200,7 @@ def test_a_run_with_ratios_resumes_bit_identically(alone, tmp_path):
     saved = checkpoint.read_manifest(tmp_path)
     assert 0 < saved.updates < 30 and saved.updates % NORM_EVERY
     loop.train(RUN, tmp_path, progress=False, agent=agent, resume=saved)
-    assert rows(whole) == rows(tmp_path)
+    assert rows_of(whole) == rows_of(tmp_path)
     assert len(set(used(whole))) == 3 and min(used(whole)) > 0
 
 

@@ -8,11 +8,11 @@ import shutil
 import signal
 
 import pytest
-from absl import flags
 
 from experiments import draw, evaluate, train
 from experiments.command_line import flags as config_flags
 from tests.helpers import SMALL, last_of_each, write_checkpoint, write_run
+from tests.in_process import parse
 
 LIMIT_S = 20
 """A case that takes longer has failed; what waits for a pipe waits for ever."""
@@ -57,9 +57,8 @@ def source(valid, folder):
 
 def call(program, *arguments):
     """Runs an entry point in this process, with flags of its own; returns its exit status."""
-    module, values = {"train": train, "evaluate": evaluate, "draw": draw}[program], flags.FlagValues()
+    module = {"train": train, "evaluate": evaluate, "draw": draw}[program]
     main = train.train if module is train else module.main
-    module.define_flags(values)
 
     def late(*_):
         raise TimeoutError(arguments)
@@ -67,7 +66,7 @@ def call(program, *arguments):
     handler = signal.signal(signal.SIGALRM, late)
     signal.alarm(LIMIT_S)
     try:
-        config_flags.parse([program, *last_of_each(arguments)], values)
+        values = parse(module, *last_of_each(arguments))
         return config_flags.guarded(lambda _: main(values))([program]) or 0
     except SystemExit as ended:
         return ended.code

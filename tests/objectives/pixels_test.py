@@ -190,15 +190,15 @@ def test_what_is_corrupted_has_no_view_of_its_own():
 
 @pytest.fixture(scope="module")
 def catch() -> Window:
-    """The first windows of 64 games of Catch under a random policy, of one step."""
-    env = make("Catch", num_envs=64, seed=0, frame_size=42)
+    """The first windows of 32 games of Catch under a random policy, of one step."""
+    env = make("Catch", num_envs=32, seed=0, frame_size=42)
     rng = np.random.default_rng(0)
-    actions = [rng.integers(0, 3, 64) for _ in range(STACK)]
+    actions = [rng.integers(0, 3, 32) for _ in range(STACK)]
     frames = [env.reset()[0], *(env.step(a)[0] for a in actions)]
     env.close()
-    ones = np.ones((64, 1), np.float32)
+    ones = np.ones((32, 1), np.float32)
     return Window(
-        frames=np.stack(frames, 1).reshape(64, STACK + 1, 42, 42, 1),
+        frames=np.stack(frames, 1).reshape(32, STACK + 1, 42, 42, 1),
         actions=actions[-1][:, None].astype(np.int32),
         rewards=0 * ones,
         discounts=ones,

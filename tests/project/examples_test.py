@@ -8,19 +8,18 @@ import gymnasium
 import jax
 import numpy as np
 import pytest
-from absl import flags
 from gymnasium.utils.env_checker import check_env
 
 from examples import foreign_loop, own_objective, use_an_encoder
 from examples.own_environment import Dot
 from experiments import train
-from experiments.command_line import flags as config_flags
 from srl_jax import encoders, envs
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout, run
 from srl_jax.files.metrics import read_metrics
 from srl_jax.types import Latents
 from tests.helpers import make_context, make_window
+from tests.in_process import parse
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 GAME = "examples.own_environment:Dot-v0"
@@ -46,12 +45,9 @@ def few_held_out(monkeypatch):
 
 def trained(*arguments):
     """Trains a small run as the command line does."""
-    values = flags.FlagValues()
-    train.define_flags(values)
     given = {argument.partition("=")[0] for argument in arguments}
     small = [f"--{name}={value}" for name, value in SMALL.items() if f"--{name}" not in given]
-    config_flags.parse(["train", *arguments, *small], values)
-    assert train.train(values) == 0
+    assert train.train(parse(train, *arguments, *small)) == 0
 
 
 def command(example, out):

@@ -6,20 +6,18 @@ import threading
 import time
 
 import pytest
-from absl import flags
 
 from experiments import evaluate
-from experiments.command_line import flags as config_flags
 from srl_jax import loading
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
-from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.files.resuming import all_to_resume, has_ended
 from srl_jax.run import ending, evaluations, loop
 from srl_jax.run.actor import seed_for
 from srl_jax.run.evaluations import FINAL, games
-from tests.helpers import SMALL, agent_of, stop_after
+from tests.helpers import SMALL, agent_of, rows_of, stop_after
+from tests.in_process import parse
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
@@ -37,12 +35,8 @@ def resume(path, config=CONFIG, **options):
     return train(path, config, resume=checkpoint.newest_good(path, pytest.fail), **options)
 
 
-def rows(path):
-    return [strip_wall(row) for row in read_metrics(path / "metrics.jsonl")]
-
-
 def kinds(path):
-    return [(row["kind"], row["env_steps"]) for row in rows(path) if row["kind"] != "train"]
+    return [(row["kind"], row["env_steps"]) for row in rows_of(path) if row["kind"] != "train"]
 
 
 def files(path):
@@ -66,7 +60,7 @@ def test_the_games_are_a_function_of_the_seed_the_kind_and_the_moment():
 
 def test_a_run_ends_with_the_row_of_its_final_games(whole):
     assert kinds(whole) == [("eval", 0), ("eval", 60), ("eval", 120), ("final", 120)]
-    row = rows(whole)[-1]
+    row = rows_of(whole)[-1]
     returns, lengths = row["final/returns"], row["final/lengths"]
     assert len(returns) == len(lengths) == row["final/games"] == 5
     mean = sum(returns) / 5
@@ -80,14 +74,11 @@ def test_a_run_ends_with_the_row_of_its_final_games(whole):
 
 def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
     def play(*arguments, run=whole):
-        values = flags.FlagValues()
-        evaluate.define_flags(values)
-        config_flags.parse(["evaluate", str(run), "--final", *arguments], values, "run")
-        evaluate.main(values)
+        evaluate.main(parse(evaluate, run, "--final", *arguments, positional="run"))
 
     monkeypatch.setattr(loading, "make_agent", lambda *of, trained: agent_of(*of))
     play()
-    played, row = json.loads(capsys.readouterr().out), rows(whole)[-1]
+    played, row = json.loads(capsys.readouterr().out), rows_of(whole)[-1]
     assert (played["returns"], played["lengths"]) == (row["final/returns"], row["final/lengths"])
     for given in ("--games=3", "--envs=1", "--seed=5", "--epsilon=0.5"):
         with pytest.raises(ConfigError, match=f"{given}: given beside --final"):
@@ -99,7 +90,7 @@ def test_the_games_can_be_played_again(whole, monkeypatch, capsys):
 
 def test_nothing_else_of_a_run_depends_on_its_final_games(whole, tmp_path):
     train(tmp_path / "run", dataclasses.replace(CONFIG, final_games=0))
-    assert rows(tmp_path / "run") == rows(whole)[:-1]
+    assert rows_of(tmp_path / "run") == rows_of(whole)[:-1]
     assert files(tmp_path / "run") == files(whole)
 
 
@@ -144,7 +135,7 @@ def test_a_stop_is_obeyed_at_once_and_the_row_is_the_same_later(whole, tmp_path,
     manifest = checkpoint.read_manifest(path)
     assert "run.json" in manifest.files and not has_ended(path, manifest, CONFIG)
     assert not resume(path).interrupted
-    assert rows(path) == rows(whole) and files(path) == files(whole)
+    assert rows_of(path) == rows_of(whole) and files(path) == files(whole)
     assert has_ended(path, checkpoint.read_manifest(path), CONFIG)
 
 
@@ -155,7 +146,7 @@ def test_a_stop_is_obeyed_while_a_row_waits_for_an_evaluation(whole, tmp_path, m
         result = train(path, stop=stop)
     assert result.interrupted and result.env_steps == result.saved == 76  # a row is due after 80
     assert not resume(path).interrupted
-    assert rows(path) == rows(whole)
+    assert rows_of(path) == rows_of(whole)
 
 
 def test_a_run_that_is_killed_meanwhile_plays_them_again(whole, tmp_path, monkeypatch):
@@ -171,7 +162,7 @@ def test_a_run_that_is_killed_meanwhile_plays_them_again(whole, tmp_path, monkey
     with monkeypatch.context() as patch:
         patch.setattr(loop.Run, "step", lambda run: trained.append(run))
         resume(path)
-    assert not trained and rows(path) == rows(whole) and files(path) == files(whole)
+    assert not trained and rows_of(path) == rows_of(whole) and files(path) == files(whole)
 
 
 def test_an_extended_run_plays_them_at_its_new_end(tmp_path, monkeypatch):
@@ -183,7 +174,7 @@ def test_an_extended_run_plays_them_at_its_new_end(tmp_path, monkeypatch):
     assert has_ended(path, manifest, shorter) and not has_ended(path, manifest, longer)
     assert kinds(path)[-1] == ("final", 120)
     resume(path, longer)
-    assert rows(path) == rows(tmp_path / "whole") and kinds(path)[-1] == ("final", 160)
+    assert rows_of(path) == rows_of(tmp_path / "whole") and kinds(path)[-1] == ("final", 160)
     # Loggers have what was: the games of the first end, too, and no row is left out.
     steps = [line.partition(",")[0] for line in (path / "metrics.csv").read_text().splitlines()[1:]]
     assert steps == ["0", "40", "60", "80", "120", "120", "120", "160", "160"]
@@ -207,7 +198,7 @@ def test_seeds_of_one_process_each_have_their_own(tmp_path):
         config.save(out)
     loop.train_seeds(config, [0, 1], outs, progress=False)
     assert [kinds(out)[-1] for out in outs] == [("final", 60)] * 2
-    first, second = (rows(out)[-1]["final/lengths"] for out in outs)
+    first, second = (rows_of(out)[-1]["final/lengths"] for out in outs)
     assert first != second
 
 
@@ -230,11 +221,11 @@ def test_of_seeds_of_which_one_had_ended_both_resume_from_before(tmp_path, monke
             loop.train_seeds(config, [0, 1], outs, progress=False)
     ends = [checkpoint.read_manifest(out) for out in outs]
     assert [("run.json" in end.files, end.env_steps) for end in ends] == [(False, 120), (True, 120)]
-    before = [rows(out) for out in outs]
+    before = [rows_of(out) for out in outs]
     found = all_to_resume(runs)
     assert [(m.env_steps, "run.json" in m.files) for m in found] == [(80, True)] * 2
     loop.train_seeds(config, [0, 1], outs, progress=False, resume=found)
-    assert [rows(out) for out in outs] == before
+    assert [rows_of(out) for out in outs] == before
 
 
 def test_a_run_without_a_policy_has_none(tmp_path):

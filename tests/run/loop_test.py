@@ -8,11 +8,9 @@ import time
 import jax
 import numpy as np
 import pytest
-from absl import flags
 from gymnasium.spaces import Box
 from gymnasium.vector.utils import batch_space
 
-from experiments.command_line import flags as config_flags
 from srl_jax import loading
 from srl_jax.config import Config
 from srl_jax.diagnostics import heldout
@@ -20,13 +18,14 @@ from srl_jax.diagnostics.pictures import PICTURES
 from srl_jax.envs.catch import Catch
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
-from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.files.metrics import read_metrics
 from srl_jax.learning.modes import ENCODER_OPTIMIZERS
 from srl_jax.learning.update import Hyper
 from srl_jax.run import actor, loop
 from srl_jax.run.schedules import Schedules
 from srl_jax.types import Window
-from tests.helpers import JOINT, SMALL, one_run, stop_after, whole
+from tests.helpers import JOINT, SMALL, one_run, rows_of, stop_after, whole
+from tests.in_process import parse
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
@@ -51,11 +50,8 @@ def test_same_seed_same_metrics(joint, tmp_path):
     train(tmp_path / "again", **JOINT, seed=3, diagnostics=True)
     train(tmp_path / "other", **JOINT, seed=4)
 
-    def rows(p):
-        return [strip_wall(row) for row in read_metrics(p / "metrics.jsonl")]
-
-    assert rows(path) == rows(tmp_path / "again")
-    assert rows(path) != rows(tmp_path / "other")
+    assert rows_of(path) == rows_of(tmp_path / "again")
+    assert rows_of(path) != rows_of(tmp_path / "other")
     assert files_of(path) == files_of(tmp_path / "again")
     assert {folder.name for folder in (path / "encoders").iterdir()} == {"000000000", "000000120"}
 
@@ -84,9 +80,7 @@ def test_neither_timing_nor_diagnostics_change_anything(joint, tmp_path, monkeyp
     train(tmp_path / "again", **JOINT, seed=3)
     ours, theirs = files_of(tmp_path / "again"), files_of(path)
     assert ours == {name: sums for name, sums in theirs.items() if name.parent.name != "encoders"}
-    rows, diagnosed = (
-        [strip_wall(row) for row in read_metrics(p / "metrics.jsonl")] for p in (tmp_path / "again", path)
-    )
+    rows, diagnosed = rows_of(tmp_path / "again"), rows_of(path)
     kept = [{key: x for key, x in row.items() if not key.startswith("diag/")} for row in diagnosed]
     assert kept == rows != diagnosed
 
@@ -222,18 +216,12 @@ def test_a_given_checkpoint_is_played_as_long_as_its_evaluations(joint, monkeypa
         return make(*arguments, **options)
 
     monkeypatch.setattr(actor, "make_env", make_env)
-    values = flags.FlagValues()
-    evaluate.define_flags(values)
-    config_flags.parse(["evaluate", f"--run={joint[0]}", "--games=1"], values)
-    evaluate.main(values)
+    evaluate.main(parse(evaluate, f"--run={joint[0]}", "--games=1"))
     assert asked == [(("eval", 1), {"seed": 0})]
     written = capsys.readouterr()
     assert len(json.loads(written.out)["returns"]) == 1 and "cut" not in written.err
 
-    values = flags.FlagValues()
-    evaluate.define_flags(values)
-    config_flags.parse(["evaluate", f"--run={joint[0]}", "--games=2", "--max_steps=3"], values)
-    evaluate.main(values)
+    evaluate.main(parse(evaluate, f"--run={joint[0]}", "--games=2", "--max_steps=3"))
     written = capsys.readouterr()
     assert json.loads(written.out)["lengths"] == [3, 3]
     assert "2 of the games were cut at 3 env steps" in written.err
@@ -284,7 +272,7 @@ def test_a_run_in_colour_of_any_shape(tmp_path, monkeypatch):
             if result.interrupted:
                 assert result.env_steps == 60
                 result = loop.train(config, path, progress=False, resume=whole(path))
-            rows.append([strip_wall(row) for row in read_metrics(path / "metrics.jsonl")])
+            rows.append(rows_of(path))
     assert rows[0] == rows[1] and rows[0][-1]["env_steps"] == 120
     # What is seen, learnt, recorded and measured has the environment's shape.
     assert result.recording.shape[1:] == (42, 50, 3)

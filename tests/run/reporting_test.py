@@ -9,11 +9,12 @@ from hypothesis import strategies as st
 
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.files.metrics import read_metrics
 from srl_jax.learning.optim import NOT_MEASURED
 from srl_jax.run import reporting
 from srl_jax.run.evaluate import Evaluation
 from srl_jax.run.reporting import Means, Report
+from tests.helpers import rows_of
 
 
 def one_by_one(rows, name):
@@ -122,10 +123,6 @@ def go_on(one, first, last):
             one.eval_row(10 * (step + 1), step, {"eval/return_mean": step / 3})
 
 
-def stripped(out):
-    return [strip_wall(row) for row in read_metrics(out / "metrics.jsonl")]
-
-
 @pytest.mark.parametrize("stop", range(0, 12))
 @pytest.mark.parametrize("later", [0, 1, 9])
 def test_rows_after_a_snapshot_are_those_that_would_have_been(tmp_path, stop, later):
@@ -143,8 +140,8 @@ def test_rows_after_a_snapshot_are_those_that_would_have_been(tmp_path, stop, la
     again.restore(snapshot)
     with again:
         go_on(again, stop, 24)
-    rows = stripped(tmp_path / "killed")
-    assert rows == stripped(tmp_path / "whole")
+    rows = rows_of(tmp_path / "killed")
+    assert rows == rows_of(tmp_path / "whole")
     assert [row["env_steps"] for row in rows if row["kind"] == "train"] == [40, 80, 120, 160, 200, 240]
     # By hand: before the first row, steps 0 and 3 ended two episodes each.
     assert rows[0]["train/episodes"] == 4

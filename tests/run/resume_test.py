@@ -15,11 +15,10 @@ from srl_jax import envs, replay
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.files import checkpoint
-from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.run import evaluations, loop
 from srl_jax.run.actor import seed_for
 from tests.files.rundir_test import contents
-from tests.helpers import SMALL, agent_of, all_moved, identical, one_run
+from tests.helpers import SMALL, agent_of, all_moved, identical, one_run, rows_of
 
 MODES = {
     "rl_only": {},
@@ -79,10 +78,6 @@ def resume(config, path, stop_at=None):
     return go(config, path, stop_at, resume=[manifest])
 
 
-def rows(path):
-    return [strip_wall(row) for row in read_metrics(path / "metrics.jsonl")]
-
-
 def files(path):
     """The last checkpoint's, with their sums, and which ones there are."""
     folders = sorted(p.relative_to(path) for p in path.glob("*/0*"))
@@ -134,7 +129,7 @@ def test_a_run_that_is_stopped_and_goes_on_is_the_run_that_was_not(whole, tmp_pa
         stopped, end = resume(config, path, now)
     assert not stopped.interrupted
     assert {name for name in whole_end if end[name] != whole_end[name]} == set()
-    assert rows(path) == rows(whole_path)
+    assert rows_of(path) == rows_of(whole_path)
     # Parameters alone, of the last two checkpoints; and encoders.
     ours, folders = files(path)
     assert ours == files(whole_path)[0]
@@ -171,10 +166,10 @@ def test_a_run_that_is_killed_goes_on_from_its_last_checkpoint(whole, tmp_path, 
         with pytest.raises(RuntimeError, match="killed"):
             go(config, tmp_path / "run")
     assert checkpoint.read_manifest(tmp_path / "run").env_steps == 104
-    assert len(rows(tmp_path / "run")) > 4
+    assert len(rows_of(tmp_path / "run")) > 4
     _, end = resume(config, tmp_path / "run")
     assert end == whole_end
-    assert rows(tmp_path / "run") == rows(whole_path)
+    assert rows_of(tmp_path / "run") == rows_of(whole_path)
 
 
 def test_a_run_goes_on_without_the_encoder_that_it_started_from(whole, tmp_path):
@@ -185,7 +180,7 @@ def test_a_run_goes_on_without_the_encoder_that_it_started_from(whole, tmp_path)
     shutil.rmtree(tmp_path / "source")
     _, end = resume(config, tmp_path / "run")
     assert end == whole_end
-    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
+    assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole")
 
 
 @pytest.mark.parametrize("stop", [120, 124])
@@ -204,7 +199,7 @@ def test_a_return_that_ends_a_run_ends_it_all_the_same(tmp_path, monkeypatch, st
     go(config, tmp_path / "run", stop)
     result, end = resume(config, tmp_path / "run")
     assert result.env_steps == 160 and end == whole_end
-    assert rows(tmp_path / "run") == rows(tmp_path / "whole")
+    assert rows_of(tmp_path / "run") == rows_of(tmp_path / "whole")
 
 
 def test_a_best_policy_of_after_the_checkpoint_goes(stopped, tmp_path):
@@ -235,7 +230,7 @@ def test_a_finished_run_that_is_extended_is_the_run_that_was_longer(whole, tmp_p
     assert not result.interrupted and result.env_steps == steps
     result, end = resume(config, path)
     assert not result.interrupted and result.env_steps == 200
-    assert end == whole_end and rows(path) == rows(whole_path)
+    assert end == whole_end and rows_of(path) == rows_of(whole_path)
     assert files(path)[0] == files(whole_path)[0]
 
 

@@ -6,10 +6,10 @@ import pytest
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, Diverged
 from srl_jax.files import checkpoint
-from srl_jax.files.metrics import read_metrics, strip_wall
+from srl_jax.files.metrics import read_metrics
 from srl_jax.run import ending, loop
 from srl_jax.run.loop import train_seeds
-from tests.helpers import stop_after
+from tests.helpers import rows_of, stop_after
 
 pytestmark = pytest.mark.usefixtures("shared_agents")
 
@@ -75,8 +75,7 @@ def test_seeds_that_are_stopped_and_go_on_are_those_that_were_not(runs, path, tm
     results = train(resume=manifests)
     assert [(r.interrupted, r.updates) for r in results] == [(False, 20)] * 2
     for out in outs:
-        again, whole = (read_metrics(folder / out.name / "metrics.jsonl") for folder in (tmp_path, path))
-        assert [strip_wall(row) for row in again] == [strip_wall(row) for row in whole]
+        assert rows_of(tmp_path / out.name) == rows_of(path / out.name)
         ours, theirs = (checkpoint.read_manifest(folder / out.name).files for folder in (tmp_path, path))
         assert ours == theirs  # the same sums: parameters are bit-identical
 

@@ -12,15 +12,14 @@ from pathlib import Path
 from unittest import mock
 
 import pytest
-from absl import flags
 
 from experiments import train
-from experiments.command_line import flags as config_flags
 from srl_jax.config import Config
 from srl_jax.files import checkpoint
 from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.files.provenance import git_revision
 from tests.helpers import last_of_each
+from tests.in_process import parse
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -45,6 +44,7 @@ def pytest_addoption(parser):
     for name, (number, text) in AMOUNTS.items():
         group.addoption(f"--{name}", type=int, default=number, help=f"{text} (default: {number:,})")
     group.addoption("--table", type=Path, help="file to write the table to")
+    group.addoption("--pictures", type=Path, help="folder to keep pictures of pages in")
 
 
 def pytest_collection_modifyitems(items):
@@ -107,10 +107,7 @@ small_chunks = mock.patch("srl_jax.replay.CHUNK_BYTES", 200_000)
 
 def train_here(*arguments):
     """`experiments.train` in this process; returns its status, raises what it raises."""
-    values = flags.FlagValues()
-    train.define_flags(values)
-    config_flags.parse(["train", *last_of_each(arguments)], values)
-    return train.train(values)
+    return train.train(parse(train, *last_of_each(arguments)))
 
 
 @pytest.fixture(scope="session")

@@ -10,18 +10,15 @@ import signal
 import sys
 from pathlib import Path
 
-from absl import flags
-
 from experiments import train
 from experiments.command_line import flags as config_flags
+from tests.in_process import parse
 from tests.soak.faults import Faults
 
 
 def main(arguments: list[str]) -> int:
     number, *rest = arguments
-    values = flags.FlagValues()
-    train.define_flags(values)
-    config_flags.parse(["train", *rest], values)
+    values = parse(train, *rest)
 
     from srl_jax import replay
 

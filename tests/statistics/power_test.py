@@ -4,22 +4,18 @@ import shutil
 
 import numpy as np
 import pytest
-from absl import flags
 from scipy import stats
 
 from experiments import power
-from experiments.command_line import flags as config_flags
 from srl_jax import data
 from srl_jax.errors import ConfigError
 from srl_jax.statistics import MOST, runs_needed, smallest_effect, welch_p, welch_power
 from tests.helpers import NOT_FINITE, write_run
+from tests.in_process import parse
 
 
 def _lines(*arguments):
-    values = flags.FlagValues()
-    power.define_flags(values)
-    config_flags.parse(["power", *map(str, arguments)], values)
-    return [line.split() for line in power.report(values)]
+    return [line.split() for line in power.report(parse(power, *arguments))]
 
 
 def test_of_many_runs_it_is_the_noncentral_t_of_equal_spreads():

@@ -5,10 +5,10 @@ import json
 
 import numpy as np
 import pytest
-from absl import flags
 
 from experiments.analyses import coverage, populations
 from srl_jax import statistics
+from tests.in_process import parse
 
 
 def _covered(arms, runs, experiments, statistic=coverage.mean, games=1):
@@ -93,11 +93,8 @@ def test_the_table_has_a_column_for_each_number_of_runs(monkeypatch):
 
 
 def test_it_writes_what_it_prints(monkeypatch, tmp_path, capsys):
-    values = flags.FlagValues()
-    coverage.define_flags(values)
-    values(["coverage", "--experiments=5", f"--out={tmp_path / 'new'}"])
     monkeypatch.setattr(coverage, "RUNS", (3,))
     monkeypatch.setattr(coverage, "sources", lambda: [coverage.Returns("a", [[np.arange(9.0)]])])
-    coverage.main(values)
+    coverage.main(parse(coverage, "--experiments=5", f"--out={tmp_path / 'new'}"))
     written = json.loads((tmp_path / "new/coverage.json").read_text())
     assert coverage.lines(written["covered"]) == capsys.readouterr().out.splitlines()

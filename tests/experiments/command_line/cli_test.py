@@ -3,7 +3,6 @@
 import importlib
 
 import pytest
-from absl import flags
 
 from experiments import train
 from experiments.command_line import flags as config_flags
@@ -16,11 +15,11 @@ JOINT = ["--game=Catch", "--mode=joint", "--objective=reconstruction"]
 
 
 def _config(*arguments):
-    return config_flags.config_from_flags(parse(arguments), complete=False)
+    return config_flags.config_from_flags(parse(train, *arguments), complete=False)
 
 
 def test_every_field_is_a_flag_with_help_and_its_default():
-    values = parse([])
+    values = parse(train)
     assert config_flags.config_from_flags(values) == Config()
     for name, info in INFOS.items():
         flag = values[info.flag or name]
@@ -212,11 +211,9 @@ def test_bad_input_is_one_line_and_status_2(arguments, flag, choice, tmp_path, c
     ],
 )
 def test_a_flag_that_means_one_value_is_refused_twice(program, flag, hint, capsys):
-    values = flags.FlagValues()
-    importlib.import_module(f"experiments.{program}").define_flags(values)
     value = "Catch" if flag == "games" and program != "evaluate" else "1"
     with pytest.raises(SystemExit) as ended:
-        config_flags.parse([program, f"--{flag}={value}", f"--{flag}={value}"], values)
+        parse(importlib.import_module(f"experiments.{program}"), *[f"--{flag}={value}"] * 2)
     assert ended.value.code == 2
     assert capsys.readouterr() == ("", f"error: --{flag}: given 2 times; {hint}\n")
 

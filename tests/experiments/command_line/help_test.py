@@ -15,20 +15,17 @@ from experiments.command_line.cli import COMMANDS
 from experiments.presets import PIECES, PIECES_HELP, PRESETS
 from srl_jax import encoders, objectives, rl
 from srl_jax.config import INFOS
+from tests.in_process import parse
 
 
 def _text(module):
-    values = flags.FlagValues()
-    module.define_flags(values)
-    return help.text("Does a thing.", values)
+    return help.text("Does a thing.", parse(module))
 
 
 def test_every_flag_of_training_is_in_one_group():
     names = " ".join(help.GROUPS.values()).split()
     assert len(names) == len(set(names))
-    values = flags.FlagValues()
-    train.define_flags(values)
-    assert set(names) == set(values)
+    assert set(names) == set(parse(train))
     assert {info.flag or name for name, info in INFOS.items()} <= set(names)
 
 

@@ -7,12 +7,11 @@ import subprocess
 import sys
 
 import pytest
-from absl import flags
 
 from experiments import evaluate, train
-from experiments.command_line import flags as config_flags
 from experiments.command_line import runtime
-from srl_jax.files.metrics import read_metrics, strip_wall
+from tests.helpers import rows_of
+from tests.in_process import parse
 
 ROOT = pathlib.Path(__file__).resolve().parents[3]
 CACHE = pathlib.Path("/cache/xla")
@@ -199,16 +198,10 @@ def test_off_leaves_everything(started, tmp_path, capsys):
 
 @pytest.mark.parametrize("module", [train, evaluate])
 def test_the_flag_is_a_flag_of_both_entry_points(module, capsys):
-    values = flags.FlagValues()
-    module.define_flags(values)
     with pytest.raises(SystemExit) as ended:
-        config_flags.parse(["program", "--tune_runtime=x"], values)
+        parse(module, "--tune_runtime=x")
     assert ended.value.code == 2
     assert capsys.readouterr() == ("", "error: --tune_runtime=x: valid: auto, off\n")
-
-
-def _rows(run):
-    return [strip_wall(row) for row in read_metrics(run / "metrics.jsonl")]
 
 
 @pytest.mark.skipif(not runtime.has_glibc(), reason="only glibc's variables need a restart")
@@ -232,9 +225,6 @@ def test_training_restarts_once_and_learns_the_same(tmp_path):
     (line,) = (line for line in done.stderr.splitlines() if line.startswith("runtime: "))
     assert line.startswith("runtime: restarting with ") and len(line) < 100
     # In this process nothing restarts.
-    values = flags.FlagValues()
-    train.define_flags(values)
-    config_flags.parse(["train", *small, f"--out={tmp_path / 'off'}"], values)
-    assert train.train(values) == 0
-    assert "loss/latent_l2" in _rows(tmp_path / "auto")[-1]
-    assert _rows(tmp_path / "auto") == _rows(tmp_path / "off")
+    assert train.train(parse(train, *small, f"--out={tmp_path / 'off'}")) == 0
+    assert "loss/latent_l2" in rows_of(tmp_path / "auto")[-1]
+    assert rows_of(tmp_path / "auto") == rows_of(tmp_path / "off")

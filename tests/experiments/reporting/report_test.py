@@ -6,19 +6,19 @@ import io
 import json
 import re
 import shutil
+from functools import partial
 from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from absl import flags
 
 from experiments import report
-from experiments.command_line import flags as config_flags
 from experiments.drawing import images, plots
 from srl_jax.config import Config
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from tests import helpers
+from tests.in_process import parse
 
 pytest.importorskip("PIL.Image", reason="needs the extra plots")
 pages = pytest.importorskip("experiments.reporting.page", reason="needs the extra plots")
@@ -328,11 +328,7 @@ def test_what_is_not_what_training_writes_is_named(runs, tmp_path, monkeypatch, 
         build(tmp_path / "runs", force=True)
 
 
-def parsed(*arguments):
-    values = flags.FlagValues()
-    report.define_flags(values)
-    config_flags.parse(["report", *map(str, arguments)], values, "runs")
-    return values
+parsed = partial(parse, report, positional="runs")
 
 
 def test_the_command_line(monkeypatch, tmp_path, capsys):

@@ -7,11 +7,9 @@ import re
 
 import numpy as np
 import pytest
-from absl import flags
 
 from experiments import figures, packing
 from experiments.arms import figures_named
-from experiments.command_line import flags as config_flags
 from experiments.presets import PRESETS
 from experiments.reporting import score_table
 from experiments.runs import collect, scores
@@ -22,6 +20,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.run import ending
 from srl_jax.run.ending import Ending
 from tests.helpers import NOT_FINITE, write_run
+from tests.in_process import parse
 
 REPORTED, RERUN = scores.BESIDE["der"]
 GAMES = ["Boxing", "Pong"]
@@ -222,10 +221,7 @@ def test_every_preset_of_the_literature_has_published_scores_beside_it():
 
 
 def call(*arguments):
-    values = flags.FlagValues()
-    figures.define_flags(values)
-    config_flags.parse(["figures", *arguments], values)
-    return figures.run(values)
+    return figures.run(parse(figures, *arguments))
 
 
 def test_the_figure_is_the_same_from_packed_runs_byte_for_byte(runs, tmp_path, capsys):

@@ -6,19 +6,16 @@ import subprocess
 import sys
 
 import pytest
-from absl import flags
 
 from experiments import sweep
-from experiments.command_line import flags as config_flags
 from experiments.sweeping import manifest, options
 from srl_jax.errors import ConfigError
 from tests.experiments.sweeping.sweep_test import ALL, A
+from tests.in_process import parse
 
 
 def _main(*arguments):
-    values = flags.FlagValues()
-    sweep.define_flags(values)
-    config_flags.parse(["sweep", *arguments], values)
+    values = parse(sweep, *arguments)
     root = pathlib.Path(values["out"].value)
     return values, root
 
