@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from srl_jax import envs
+from srl_jax import envs, specs
 from srl_jax.config import INFOS, Config
 from srl_jax.errors import ConfigError
 from srl_jax.files.provenance import history
@@ -45,8 +45,9 @@ def settings(
     """Every field of the configurations, apart from game and seed; specifications by their options.
 
     Returns:
-        field -> arm -> value, where two arms differ on a game; and field -> value of what they share. Where
-        games differ, a value is that of each game.
+        field -> arm -> value, where two arms differ on a game; and field -> value of what they share, as they
+        do an option that has its default in every arm whose objective it is. Where games differ, a value is
+        that of each game.
     """
     found: dict[str, dict[str, dict[str, set[str]]]] = {}
     configs = [(run, _fields(run.config)) for run in runs]
@@ -61,9 +62,12 @@ def settings(
             return next(iter(texts.values()))
         return "; ".join(f"{game}: {value}" for game, value in texts.items())
 
-    differing, shared = {}, {}
+    differing, shared, defaults = {}, {}, _defaults(names)
     for name, games in found.items():
-        if any(
+        texts = set().union(*(texts for by_arm in games.values() for texts in by_arm.values()))
+        if texts == {"–", defaults.get(name)}:
+            shared[name] = f"{defaults[name]}, where the objective is"
+        elif any(
             by_arm[arm] != by_arm[other] for by_arm in games.values() for arm in by_arm for other in by_arm
         ):
             differing[name] = {arm: text({g: x[arm] for g, x in games.items() if arm in x}) for arm in arms}
@@ -85,6 +89,20 @@ def glossary(
         ]
         found[run.arm] = "; ".join([MODES[run.config.mode].help, *parts])
     return found
+
+
+def _defaults(names: Sequence[str]) -> dict[str, str]:
+    """What options of the objectives here have if nothing is said, as `_fields` names them."""
+    rows = {name.split()[1].rstrip(":") for name in names if name.startswith("objectives ")}
+    if not rows:
+        return {}
+    from srl_jax.objectives import REGISTRY  # which imports jax
+
+    return {
+        f"objectives {row}: {option}": specs.value_text(value)
+        for row in rows & set(REGISTRY)
+        for option, value in specs.option_defaults(REGISTRY[row]).items()
+    }
 
 
 def _place(name: str) -> tuple:

@@ -135,8 +135,9 @@ def _around(link: str, *places: str | Path) -> bool:
 
 
 def natural(text: str) -> list:
-    """A key for sorting names with numbers in them by these: seed2 before seed10."""
-    return [int(part) if i % 2 else part for i, part in enumerate(re.split(r"(\d+)", text))]
+    """A key for sorting names with numbers in them by these: seed2 before seed10, x03 (0.3) before x1."""
+    parts = re.split(r"(\d+)", text)
+    return [float(re.sub(r"^0(?=\d)", "0.", part)) if i % 2 else part for i, part in enumerate(parts)]
 
 
 def run_directories(root: Path) -> list[Path]:

@@ -13,11 +13,31 @@ from experiments.runs import collect
 from experiments.runs.collect import RunData
 from srl_jax.config import Config
 from srl_jax.run.ending import Ending
+from srl_jax.training import completed
 from tests.experiments.reporting.report_test import write_run
 
 Image = pytest.importorskip("PIL.Image", reason="needs the extra plots")
 pages = pytest.importorskip("experiments.reporting.page", reason="needs the extra plots")
 configs, gallery, numbers, pictures = pages.configs, pages.gallery, pages.numbers, pages.gallery.pictures
+
+
+def test_options_at_their_defaults_where_the_objective_is_are_no_differences():
+    both = {"mode": "joint", "encoder": "tiny"}
+    arms = {
+        "alone": Config(game="Catch", encoder="tiny"),
+        "plain": Config(game="Catch", objectives=("reconstruction",), **both),
+        "heavy": Config(game="Catch", objectives=("reconstruction:weight=2,noise=0.1",), **both),
+    }
+    runs = [RunData("", "Catch", arm, 0, completed(config), []) for arm, config in arms.items()]
+    differing, shared = configs.settings(runs, list(arms))
+    assert differing["objectives reconstruction: weight"] == {"alone": "–", "plain": "1.0", "heavy": "2.0"}
+    assert differing["objectives reconstruction: noise"] == {"alone": "–", "plain": "0.0", "heavy": "0.1"}
+    assert {name for name in differing if ": " in name} == {
+        "objectives reconstruction: weight", "objectives reconstruction: noise",
+    }  # fmt: skip
+    assert shared["objectives reconstruction: tied"] == "false, where the objective is"
+    of_plain = configs.glossary(runs, differing, "alone")["plain"]
+    assert "reconstruction weight 1.0" in of_plain and "tied" not in of_plain
 
 
 def test_whether_a_run_is_finished():

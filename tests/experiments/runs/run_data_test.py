@@ -94,6 +94,21 @@ def test_runs_come_in_the_order_of_their_numbers(tmp_path):
     assert [path.name for path in run_data.runs_below(tmp_path)] == ["seed1", "seed2", "seed10"]
 
 
+def test_numbers_in_names_are_sorted_as_numbers_and_what_begins_with_0_as_a_fraction():
+    names = [
+        "joint_50",
+        "joint_256",
+        "ratio0",
+        "ratio003",
+        "ratio01",
+        "ratio03",
+        "ratio1",
+        "ratio3",
+        "ratio10",
+    ]
+    assert sorted(reversed(names), key=run_data.natural) == names
+
+
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read everything")
 def test_what_cannot_be_read_is_said(tmp_path):
     write_run(tmp_path / "a/seed0")
