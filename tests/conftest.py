@@ -14,6 +14,7 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 # Most programs of tests run a few times only: XLA compiles them several times faster, and they run half as
 # fast. Others need `helpers.optimised`. XLA ends a process whose flags it does not know: hence the version.
 _fast = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+_fast += " --xla_cpu_parallel_codegen_split_count=1"
 if importlib.metadata.version("jaxlib").startswith("0.10."):
     os.environ.setdefault("XLA_FLAGS", _fast)
 
