@@ -16,6 +16,7 @@ os.environ.setdefault("QT_QPA_PLATFORM", "offscreen")
 os.environ.setdefault("QTWEBENGINE_CHROMIUM_FLAGS", "--disable-gpu --no-sandbox")
 pytest.importorskip("PySide6.QtWebEngineWidgets", reason="needs the extra soak", exc_type=ImportError)
 
+import shiboken6  # noqa: E402
 from PySide6.QtCore import QEventLoop, QTimer, QUrl  # noqa: E402
 from PySide6.QtWebEngineWidgets import QWebEngineView  # noqa: E402
 from PySide6.QtWidgets import QApplication  # noqa: E402
@@ -51,8 +52,7 @@ def view():
     view = QWebEngineView()
     view.settings().setAttribute(view.settings().WebAttribute.ShowScrollBars, False)
     yield view
-    view.page().deleteLater()
-    view.deleteLater()
+    shiboken6.delete(view)  # before the profile of its pages
     application.processEvents()
 
 

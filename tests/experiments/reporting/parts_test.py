@@ -40,6 +40,20 @@ def test_options_at_their_defaults_where_the_objective_is_are_no_differences():
     assert "reconstruction weight 1.0" in of_plain and "tied" not in of_plain
 
 
+def test_of_several_arms_of_rl_alone_the_one_most_like_the_others_is_the_baseline():
+    arms = {
+        "alone_other": Config(game="Catch", lr_rl=1e-3, batch_size=64),
+        "alone": Config(game="Catch"),
+        "joint": Config(game="Catch", mode="joint", objectives=("reconstruction",)),
+        "joint_rate": Config(game="Catch", mode="joint", objectives=("reconstruction",), lr_rl=1e-3),
+    }
+    row = {"kind": "eval", "env_steps": 100, "eval/return_mean": 1.0}
+    runs = [RunData("", "Catch", arm, 0, config, [row]) for arm, config in arms.items()]
+    assert numbers.baseline_of(runs, list(arms)) == "alone"
+    assert numbers.baseline_of(runs, list(arms), "joint") == "joint"
+    assert numbers.baseline_of(runs[2:], list(arms)[2:]) == "joint"  # as like as the other, and the first
+
+
 def test_whether_a_run_is_finished():
     def run(evals, trains, **values):
         rows = [{"kind": "eval", "env_steps": step, "eval/return_mean": 1.0} for step in evals]
