@@ -29,7 +29,7 @@ def define_flags(values: flags.FlagValues) -> None:
     texts("runs", None, "directory in or below which the runs are, or several; the name may be left out")
     text("out", None, "file to write, must end in .html or .htm; beside it goes a .csv")
     yes("overwrite", False, "replace the files if they are there")
-    text("baseline", None, "arm that the others are compared with; by default the arm of RL alone that is most like them")
+    text("baseline", None, "arm that the others are compared with; by default one that is RL alone")
     texts(
         "reach",
         [],
