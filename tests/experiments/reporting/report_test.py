@@ -196,9 +196,8 @@ def test_every_arm_and_every_run_is_there_as_text(page, text):
 
 
 def test_an_arm_has_one_colour_on_the_whole_page(text):
-    marks = re.findall(
-        r'<span class="mark" style="border-top: 3px (\w+ #\w+)"></span>\s*(?:Catch / )?([^<(]+)', text
-    )
+    mark = r'<svg class="mark"[^>]*><path [^>]*(stroke="#\w+" [^>]*)/></svg>'
+    marks = re.findall(rf"{mark}\s*(?:Catch / )?([^<(]+)", text)
     found = {}
     for colour, arm in marks:
         found.setdefault(arm.strip(), set()).add(colour)
