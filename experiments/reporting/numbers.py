@@ -119,9 +119,9 @@ def arms_of(runs: Sequence[RunData]) -> list[str]:
 def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None = None) -> str | None:
     """The arm that others are compared with, or None where no arm has a policy.
 
-    The one that was asked for. Else of the arms that are RL alone, or else have a policy, the one that
-    differs in the fewest settings from all others, or the first of these: of arms that can be compared, as
-    long as there are some.
+    The one that was asked for. Else of the arms that are RL alone, or else have a policy, the one on the most
+    games; of these the one that differs in the fewest settings from all others, or the first: of arms that
+    can be compared, as long as there are some.
 
     Raises:
         ConfigError: the one that was asked for is not there.
@@ -135,10 +135,11 @@ def baseline_of(runs: Sequence[RunData], arms: Sequence[str], given: str | None 
     plain = {run.arm for run in runs if run.config.mode == "rl_only"} & playing
     settings = {run.arm: {tuple(key): x for *key, x in collect.settings(run.config)} for run in runs}
 
-    def differences(arm: str) -> int:
-        return sum(len(settings[arm].items() ^ settings[other].items()) for other in playing)
+    def order(arm: str) -> tuple[int, int]:
+        differences = sum(len(settings[arm].items() ^ settings[other].items()) for other in playing)
+        return -len({run.game for run in runs if run.arm == arm}), differences
 
-    return given or min((arm for arm in arms if arm in (plain or playing)), key=differences, default=None)
+    return given or min((arm for arm in arms if arm in (plain or playing)), key=order, default=None)
 
 
 def reached_step(run: RunData) -> int:

@@ -51,6 +51,8 @@ def test_of_several_arms_of_rl_alone_the_one_most_like_the_others_is_the_baselin
     runs = [RunData("", "Catch", arm, 0, config, [row]) for arm, config in arms.items()]
     assert numbers.baseline_of(runs, list(arms)) == "alone"
     assert numbers.baseline_of(runs, list(arms), "joint") == "joint"
+    two_games = [*runs, *(runs[i]._replace(game="CatchDistractor") for i in (0, 2))]
+    assert numbers.baseline_of(two_games, list(arms)) == "alone_other"  # the other would be missing there
     assert numbers.baseline_of(runs[2:], list(arms)[2:]) == "joint"  # as like as the other, and the first
 
 
