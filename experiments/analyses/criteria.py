@@ -17,6 +17,7 @@ A campaign (--campaign) writes down before its runs what will decide, as data:
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -52,22 +53,26 @@ def areas(arms: Arms) -> dict[str, np.ndarray]:
     return {arm: ends["area_under_curve"] for arm, ends in collect.ends(curves)[1].items()}
 
 
-def drifts(arms: Arms) -> dict[str, np.ndarray]:
+def drifts(arms: Arms, key: str = "diag/drift/cosine") -> dict[str, np.ndarray]:
     """{arm: 1 less the cosine of latents with those of the encoder kept last before, mean over a run's rows}.
 
     The first row that has one is left out: it compares with the encoder from before any update.
     """
-    return {arm: np.array([_drift(run) for run in runs]) for arm, runs in arms.items()}
+    return {arm: np.array([_drift(run, key) for run in runs]) for arm, runs in arms.items()}
 
 
-def _drift(run: RunData) -> float:
-    cosines = [row["diag/drift/cosine"][-1] for row in run.rows if row.get(STEPS)]
+def _drift(run: RunData, key: str) -> float:
+    cosines = [row[key][-1] for row in run.rows if row.get(STEPS) and key in row]
     if len(cosines) < 2:
-        raise ConfigError(f"{run.path}: has no drift, which --diagnostics gives")
+        raise ConfigError(f"{run.path}: has no {key}, which --diagnostics gives")
     return 1.0 - float(np.mean(cosines[1:]))
 
 
-MEASURES: dict[str, Callable[[Arms], dict[str, np.ndarray]]] = {"area": areas, "drift": drifts}
+MEASURES: dict[str, Callable[[Arms], dict[str, np.ndarray]]] = {
+    "area": areas,
+    "drift": drifts,
+    "centred_drift": partial(drifts, key="diag/drift/centred_cosine"),
+}
 
 
 def analyse(campaign: Path, asked: Mapping[str, Any]) -> dict[str, Any]:

@@ -12,6 +12,7 @@ Keys, each a number or a list of numbers; null where there is none:
     diag/effective_rank, diag/dormant_share, diag/constant_share     `measures.py`, of the held-out latents
     diag/drift/steps                    env steps of the kept encoders, oldest first; what lists are over
     diag/drift/cosine, diag/drift/cka   latents now against those of each kept encoder
+    diag/drift/centred_cosine           the same, what all observations share taken off each latent first
     diag/decoder_now/NAME               error of the decoder of now on latents of each kept encoder and of now
     diag/encoder_now/NAME               error of each kept decoder on latents of now
     diag/error/NAME/moving, .../static  error of the newest frame on pixels that move, and on the others

@@ -61,17 +61,25 @@ def constant_share(latents: np.ndarray) -> float:
 
 
 def mean_cosine(a: np.ndarray, b: np.ndarray) -> float:
-    """The mean over observations of the cosine of two latents, [N, D] each, not centred. In [-1, 1]."""
+    """The mean over observations of the cosine of two latents, [N, D] each, not centred. In [-1, 1].
+
+    The part of a latent that all observations share decides it, where that part is large.
+    """
     a, b = a.astype(np.float64), b.astype(np.float64)
     norms = np.linalg.norm(a, axis=1) * np.linalg.norm(b, axis=1)
     with np.errstate(invalid="ignore"):
         return float(((a * b).sum(1) / norms).mean())
 
 
-def centred_gram(x: np.ndarray) -> np.ndarray:
-    """Inner products of rows, their mean taken off: [N, D] -> float64 [N, N] of norm 1, or NaN."""
+def centred(x: np.ndarray) -> np.ndarray:
+    """Latents [N, D], less their mean over observations, float64."""
     x = x.astype(np.float64)
-    x -= x.mean(0)
+    return x - x.mean(0)
+
+
+def centred_gram(x: np.ndarray) -> np.ndarray:
+    """Inner products of the rows of `centred`: [N, D] -> float64 [N, N] of norm 1, or NaN."""
+    x = centred(x)
     gram = x @ x.T
     with np.errstate(invalid="ignore"):
         return gram / np.sqrt((gram * gram).sum())

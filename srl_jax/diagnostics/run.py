@@ -115,6 +115,10 @@ class Diagnostics:
             "dormant_share": measures.dormant_share(z),
             "constant_share": measures.constant_share(z),
             "drift/cosine": [measures.mean_cosine(z, then.latents) for then in kept.values()],
+            "drift/centred_cosine": [
+                measures.mean_cosine(measures.centred(z), measures.centred(then.latents))
+                for then in kept.values()
+            ],
             "drift/cka": [measures.alignment(now.gram, then.gram) for then in kept.values()],
         }
         if self._config.frame_stack > 1:

@@ -248,6 +248,7 @@ def test_a_kept_encoder_that_is_damaged_is_named(tmp_path, monkeypatch):
         values = first.measure(state, step, None, 1.0, None)
         keep(tmp_path, first.parts(params), config, step)
     assert values["diag/drift/steps"] == [0] and values["diag/drift/cka"] == [pytest.approx(1)]
+    assert values["diag/drift/centred_cosine"] == [pytest.approx(1)]
     assert json.loads(json.dumps(values, allow_nan=False)) == values
     expected = first.measure(state, 120, None, 1.0, None)
     again = make().measure(state, 120, None, 1.0, None)

@@ -47,6 +47,10 @@ def test_cka_knows_no_rotation_and_no_scale():
     assert cka(a, -2 * a @ turn) == pytest.approx(1)
     assert measures.mean_cosine(a, -2 * a) == pytest.approx(-1)
     assert measures.mean_cosine(np.eye(2), np.array([[1, 1], [1, 0.0]])) == pytest.approx(0.5**0.5 / 2)
+    # What two latents share hides that the rest has turned round: (5, 1) and (5, -1), less (5, 0).
+    x = np.array([[5, 1.0], [5, -1]])
+    assert measures.mean_cosine(x, x[::-1]) == pytest.approx(24 / 26)
+    assert measures.mean_cosine(measures.centred(x), measures.centred(x[::-1])) == pytest.approx(-1)
 
 
 def test_errors_on_moving_and_static_pixels():

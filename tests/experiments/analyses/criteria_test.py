@@ -79,21 +79,24 @@ def test_how_often_a_dose_is_best():
     assert sum(shares.values()) == pytest.approx(1.0)
 
 
-def test_drift_is_to_the_encoder_before_from_the_second_on():
+@pytest.mark.parametrize("measure", ["drift", "centred_drift"])
+def test_drift_is_to_the_encoder_before_from_the_second_on(measure):
+    key = {"drift": "diag/drift/cosine", "centred_drift": "diag/drift/centred_cosine"}[measure]
+
     def run(*cosines):
-        rows = [{"diag/drift/steps": list(range(len(its))), "diag/drift/cosine": its} for its in cosines]
+        rows = [{"diag/drift/steps": list(range(len(its))), key: its} for its in cosines]
         return criteria.RunData(None, "Catch", "a", 0, None, rows)
 
-    found = criteria.drifts({"a": [run([], [0.1], [0.2, 0.7], [0.3, 0.4, 0.9])]})
+    found = criteria.MEASURES[measure]({"a": [run([], [0.1], [0.2, 0.7], [0.3, 0.4, 0.9])]})
     np.testing.assert_allclose(found["a"], [0.2])
-    with pytest.raises(ConfigError, match="has no drift"):
-        criteria.drifts({"a": [run([], [0.1])]})
+    with pytest.raises(ConfigError, match=f"has no {key}"):
+        criteria.MEASURES[measure]({"a": [run([], [0.1])]})
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"measures": ["areas"]}, 'expected "game", .* out of area, drift'),
+        ({"measures": ["areas"]}, 'expected "game", .* out of area, drift, centred_drift'),
         ({"families": {}}, "expected"),
         ({"families": {"a": {"b": ["low"]}}}, "expected"),
         ({"families": {"a": {"b": {"low": "1-"}}}}, "expected"),
