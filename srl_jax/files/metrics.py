@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from srl_jax.errors import ConfigError
+from srl_jax.errors import ConfigError, saving
 from srl_jax.files.reading import ROWS, parse_json, read_bytes
 
 KINDS = ("train", "eval", "final")
@@ -51,14 +51,16 @@ class MetricsWriter:
 
     Raises:
         ConfigError: the file does not begin with what it held at the mark; it is as it was.
+        SaveError: it cannot be opened, or its last line not be ended.
     """
 
     def __init__(self, path: str | os.PathLike, mark: Mark | None = None):
         if mark is not None:
             _cut(Path(path), mark)
-        _mend(Path(path))
-        self._digest = hashlib.sha256(Path(path).read_bytes() if os.path.isfile(path) else b"")
-        self._file = open(path, "ab")
+        with saving(path, "not opened"):
+            _mend(Path(path))
+            self._digest = hashlib.sha256(Path(path).read_bytes() if os.path.isfile(path) else b"")
+            self._file = open(path, "ab")
 
     def write(
         self, kind: str, env_steps: int, updates: int, wall_s: float, values: Mapping[str, Any]

@@ -1,3 +1,4 @@
+import errno
 import hashlib
 
 import jax.numpy as jnp
@@ -6,6 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from srl_jax.errors import SaveError
+from srl_jax.files import metrics
 from srl_jax.files.metrics import Mark, MetricsWriter, read_metrics, strip_wall
 
 
@@ -113,6 +116,21 @@ def test_a_file_cut_anywhere_reads_up_to_the_cut_and_can_be_continued(tmp_path):
         with MetricsWriter(path) as writer:
             writer.write("eval", 9, 0, 0.0, {})
         assert [row["env_steps"] for row in read_metrics(path)] == [*range(whole), 9]
+
+
+@pytest.mark.parametrize("whole", [True, False])
+def test_a_file_that_cannot_be_opened_or_ended_is_named(tmp_path, monkeypatch, whole):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"kind": "train", "env_steps": 1}' + whole * "\n")
+
+    def full(file, mode="r", **options):
+        if mode != "rb":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return open(file, mode, **options)
+
+    monkeypatch.setattr(metrics, "open", full, raising=False)
+    with pytest.raises(SaveError, match=r"metrics.jsonl: not opened: No space left on device$"):
+        MetricsWriter(path)
 
 
 def test_a_file_is_cut_back_to_a_mark_and_continued(tmp_path):

@@ -20,7 +20,8 @@ EVENTS = {
 class Faults:
     """A context in which operations on what lies below a directory fail, from one of them on.
 
-    A file that fails to be flushed has lost its second half, as after a write that was not finished.
+    A file that fails to be flushed has lost half of what was written to it since it was opened or last
+    flushed, as after a write that was not finished.
 
     Args:
         root: the directory.
@@ -47,6 +48,7 @@ class Faults:
     ):
         self._prefix, self._first = f"{root}{os.sep}", math.inf if first is None else first
         self._fault, self._begun = fault, begun
+        self._safe: dict[str, int] = {}  # bytes of each file that were there before, or are flushed
         self.number, self.reached = 0, ""
 
     def __enter__(self) -> "Faults":
@@ -60,8 +62,8 @@ class Faults:
     def __exit__(self, *_: object) -> None:
         Faults._active = None
 
-    def operation(self, name: str, path: object, file: int | None = None) -> None:
-        """One is about to be done."""
+    def operation(self, name: str, path: object, file: int | None = None, anew: bool = False) -> None:
+        """One is about to be done; `anew`: it opens a file that it empties."""
         if not str(path).startswith(self._prefix):
             return
         if not self.number:
@@ -70,14 +72,19 @@ class Faults:
         if self.number > self._first:
             self.reached = self.reached or name
             if file is not None and not os.path.isdir(path):
-                os.truncate(path, os.fstat(file).st_size // 2)
+                size = os.fstat(file).st_size
+                safe = min(self._safe.get(str(path), 0), size)
+                os.truncate(path, safe + (size - safe) // 2)
             self._fault(name)
+        if name in ("opening", "flushing"):
+            self._safe[str(path)] = os.path.getsize(path) if os.path.exists(path) and not anew else 0
 
 
 def _on_event(event: str, arguments: tuple) -> None:
     if Faults._active is not None and event in EVENTS:
         if event != "open" or arguments[2] & (os.O_WRONLY | os.O_RDWR):
-            Faults._active.operation(EVENTS[event], arguments[0])
+            anew = event == "open" and bool(arguments[2] & os.O_TRUNC)
+            Faults._active.operation(EVENTS[event], arguments[0], anew=anew)
 
 
 def _on_flush(file: int) -> None:
