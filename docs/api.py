@@ -21,8 +21,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 PUBLIC = (
     "srl_jax.rl", "!srl_jax.rl.losses", "srl_jax", "srl_jax.types", "srl_jax.loading",
     "srl_jax.learning.update", "srl_jax.learning.modes", "srl_jax.layers", "srl_jax.augment",
-    "srl_jax.latents", "srl_jax.window", "srl_jax.specs", "srl_jax.files.metrics", "srl_jax.files.loggers",
-    "srl_jax.diagnostics", "srl_jax.plugins", "srl_jax.errors",
+    "srl_jax.latents", "srl_jax.window", "srl_jax.envs.base", "srl_jax.specs", "srl_jax.files.metrics",
+    "srl_jax.files.loggers", "srl_jax.diagnostics", "srl_jax.plugins", "srl_jax.errors",
 )  # fmt: skip
 
 

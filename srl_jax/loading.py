@@ -17,6 +17,7 @@ from srl_jax.learning.optim import ENCODER, RL
 from srl_jax.learning.update import epsilon_greedy
 from srl_jax.run.actor import Policy
 from srl_jax.types import Array, Encoder, Params
+from srl_jax.window import check_observations
 
 
 class Loaded:
@@ -114,19 +115,7 @@ class Loaded:
         if not isinstance(observations, jax.Array):
             observations = np.array(observations)  # a copy, for jax may go on reading what it is handed
         shape = self.encoder.observation_shape
-        if observations.shape[-3:] != shape or observations.dtype not in (np.uint8, np.float32):
-            wanted, given = ", ".join(map(str, shape)), list(observations.shape)
-            raise ValueError(
-                f"observations must be uint8, or float32 in [0, 1], [..., {wanted}], not "
-                f"{observations.dtype} {given}"
-            )
-        traced = isinstance(observations, jax.core.Tracer)
-        if not traced and observations.dtype == np.float32 and observations.size:
-            low, high = float(observations.min()), float(observations.max())
-            if not 0 <= low <= high <= 1:
-                raise ValueError(
-                    f"observations of float32 must be in [0, 1], not [{low:g}, {high:g}]; give bytes as uint8"
-                )
+        check_observations(observations, shape)
         ahead = observations.shape[:-3]
         if 0 in ahead:
             one = jax.eval_shape(function, jax.ShapeDtypeStruct((1, *shape), observations.dtype))

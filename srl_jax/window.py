@@ -1,7 +1,8 @@
-"""Views of a `Window` on the device: the stacked observation at an offset."""
+"""Views of a `Window` on the device: the stacked observation at an offset; what an observation has to be."""
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from srl_jax.types import Array, Window
 
@@ -49,6 +50,35 @@ def to_unit(pixels: Array) -> Array:
     if pixels.dtype not in (jnp.uint8, jnp.float32):
         raise ValueError(f"observations must be uint8, or float32 in [0, 1], not {pixels.dtype}")
     return pixels.astype(jnp.float32) / 255.0 if pixels.dtype == jnp.uint8 else pixels
+
+
+def check_observations(observations: Array, shape: tuple[int, ...], *, ahead: str = "...") -> None:
+    """Whether these are observations; of values only where there are some, and not while jax traces.
+
+    Args:
+        observations: uint8, or float32 in [0, 1], [..., H, W, S * C].
+        shape: (H, W, S * C).
+        ahead: the axes in front, "B" for one and "..." for any.
+
+    Raises:
+        ValueError: they are not; a line with what they are.
+    """
+    axes = observations.ndim if ahead == "..." else len(shape) + 1
+    if (observations.ndim, *observations.shape[-3:]) != (axes, *shape) or observations.dtype not in (
+        np.uint8,
+        np.float32,
+    ):
+        raise ValueError(
+            f"observations must be uint8, or float32 in [0, 1], [{ahead}, {', '.join(map(str, shape))}], not "
+            f"{observations.dtype} {list(observations.shape)}"
+        )
+    traced = isinstance(observations, jax.core.Tracer)
+    if not traced and observations.dtype == np.float32 and observations.size:
+        low, high = float(observations.min()), float(observations.max())
+        if not 0 <= low <= high <= 1:
+            raise ValueError(
+                f"observations of float32 must be in [0, 1], not [{low:g}, {high:g}]; give bytes as uint8"
+            )
 
 
 def stack_last(frames: Array) -> jax.Array:

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from srl_jax import statistics
+from srl_jax import specs, statistics
 from srl_jax.data import reference_policies
 from srl_jax.errors import ConfigError
 from srl_jax.files.reading import parse_json
@@ -211,6 +211,11 @@ def measured(runs: Sequence[RunData], prefixes: Sequence[str], looks: Looks) -> 
                 alt = f"{runs[0].game}: {title}"
                 shown.append(Shown(picture, alt, caption=form["meaning"], first=bool(form["first"])))
     return shown
+
+
+def of_losses(runs: Iterable[RunData]) -> list[str]:
+    """The prefixes of what losses say beside their values: "rl/", and "NAME/" of each objective."""
+    return sorted({"rl/", *(f"{specs.split(text)[0]}/" for run in runs for text in run.config.objectives)})
 
 
 def _curve(run: RunData, key: str, place: int) -> tuple[np.ndarray, np.ndarray]:

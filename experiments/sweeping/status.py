@@ -230,9 +230,10 @@ def lines(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
         }
         at_once = counts["running"] or workers
         seconds, unknown = seconds_left(entries, steps, rates(root, entries), at_once)
-        parts.append(f"{hms(seconds)} left" if seconds else "time left unknown")
+        least = "at least " if unknown else ""
+        parts.append(f"{least}{hms(seconds)} left" if seconds else "time left unknown")
         if seconds and unknown:
-            parts[-1] += f" and {unknown} of unknown speed"
+            parts[-1] += f", without {unknown} of unknown speed"
     rows = [("run", "env steps", "steps/s", "left", "evaluation", "by")]
     rows += [_row(root, entries[name], by) for name, (kind, by) in seen.items() if kind == "running"]
     told = [f"{name}: {kind}: {why}" for name, (kind, why) in seen.items() if kind != "running" and why]
@@ -294,8 +295,9 @@ def dry_run(
     seconds, unknown = seconds_left(entries, left, per_s, workers)
     line = f"{len(left)} of {len(entries)} runs to run, {sum(left.values()):,} env steps"
     if left:
-        line += f", {hms(seconds) if seconds else 'unknown time'} with {workers} at once"
-        line += f" and {unknown} runs of unknown speed" if seconds and unknown else ""
+        least = "at least " if seconds and unknown else ""
+        line += f", {least}{hms(seconds) if seconds else 'unknown time'} with {workers} at once"
+        line += f", without {unknown} runs of unknown speed" if least else ""
         line += "; each start takes up to a minute more" if seconds else ""
     lines.append(line)
     if unknown:

@@ -1,8 +1,10 @@
 """A trained encoder as one npz file, for which numpy is enough."""
 
+import functools
 import json
 import os
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,8 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from srl_jax import encoders, plugins, specs
 from srl_jax.errors import ConfigError, SaveError
 from srl_jax.files import checkpoint
-from srl_jax.types import Encoder, Params
+from srl_jax.types import Array, Encoder, Params
+from srl_jax.window import check_observations
 
 ABOUT = "about"
 """The name of the array that holds a JSON text; all others are parameters."""
@@ -70,7 +73,8 @@ def from_npz(path: str | os.PathLike[str]) -> tuple[Encoder, Params]:
         encoder, params = srl_jax.encoders.from_npz("enc.npz")
         latents = encoder.apply(params, observations)  # uint8 [B, H, W, S * C] -> float32 [B, D]
 
-    An encoder of your own has to be registered first, as by importing its file.
+    An encoder of your own has to be registered first, as by importing its file. Its `apply` raises ValueError
+    where observations have another shape or dtype, or are float32 beyond [0, 1].
 
     Raises:
         srl_jax.errors.ConfigError: there is no such file, or it is not what export writes, or does not fit
@@ -91,4 +95,14 @@ def from_npz(path: str | os.PathLike[str]) -> tuple[Encoder, Params]:
         template = jax.eval_shape(encoder.init, jax.random.key(0))
     except (ConfigError, TypeError) as error:  # a TypeError is jax's, of shapes that cannot be
         raise ConfigError(f"{path}: {error}") from None
-    return encoder, checkpoint.load_into(template, unflatten_dict(arrays, sep="/"), os.fspath(path))
+    params = checkpoint.load_into(template, unflatten_dict(arrays, sep="/"), os.fspath(path))
+    return encoder._replace(apply=_checked(encoder.apply, shape)), params
+
+
+def _checked(apply: Callable[[Params, Array], jax.Array], shape: tuple[int, ...]) -> Callable:
+    @functools.wraps(apply)
+    def checked(params: Params, observations: Array) -> jax.Array:
+        check_observations(observations, shape, ahead="B")
+        return apply(params, observations)
+
+    return checked

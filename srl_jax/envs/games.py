@@ -240,7 +240,9 @@ def parse(text: str, flag: str = "game") -> specs.Spec:
     elif name not in REGISTRY and first and "=" not in first:
         text = f"gymnasium:id={name}:{first}{comma}{options}"
     elif name not in REGISTRY:
-        raise specs.SpecError(f"--{flag}={' '.join(text.split())}: {_instead(name)}valid: {_kinds(flag)}")
+        raise specs.SpecError(
+            f"--{flag}={' '.join(text.split())}: {_instead(name, colon)}valid: {_kinds(flag)}"
+        )
     return specs.parse(text, REGISTRY, flag)
 
 
@@ -257,10 +259,11 @@ def _kinds(flag: str) -> str:
     return ", ".join((*kinds, "gymnasium:id=Name-v0", "module:Name-v0", *others, *suites))
 
 
-def _instead(name: str) -> str:
+def _instead(name: str, colon: str) -> str:
     """`did you mean X? `, or nothing."""
     stem = re.sub(r"(NoFrameskip|Deterministic)?-v\d+$", "", name.rpartition("/")[2])
-    close = specs.near(stem, [*NAMES, *REGISTRY])
+    whole, rows = specs.near(stem, NAMES), specs.near(stem, REGISTRY)
+    close = rows + whole if colon else whole + rows
     if not close and stem != name:
         close = [f"gymnasium:id={name}"]
     return f"did you mean {close[0]}? " if close else ""
@@ -307,7 +310,7 @@ def several(parts: Iterable[str], flag: str = "games", *, others: bool = False) 
     Args:
         parts: of the list; a key of `SUITES` stands for its games.
         flag: names the flag in errors, without dashes.
-        others: there may be games of plug-ins, whose names stay as they are.
+        others: there may be games of plug-ins, whose names, unknown here, stay as they are.
 
     Raises:
         SpecError: see `game`.
@@ -318,7 +321,13 @@ def several(parts: Iterable[str], flag: str = "games", *, others: bool = False) 
             whole[-1] += f",{part}"
         else:
             whole += SUITES.get(part.strip(), [part])
-    return list(dict.fromkeys(text if others else canonical(text, flag) for text in whole))
+
+    def known(text: str) -> bool:
+        return text.strip() in NAMES or text.strip().partition(":")[0] in REGISTRY
+
+    return list(
+        dict.fromkeys(text if others and not known(text) else canonical(text, flag) for text in whole)
+    )
 
 
 def label(text: str) -> str:

@@ -85,6 +85,7 @@ def test_a_name_of_its_own_is_canonical(name):
         ("PongNoFrameskip-v4", "did you mean Pong?"),
         ("MiniGrid-Empty-5x5-v0", "did you mean gymnasium:id=MiniGrid-Empty-5x5-v0?"),
         ("cath:ball=2", "did you mean catch?"),
+        ("Ctach", "did you mean Catch?"),
         ("", "valid: an Atari-57 game"),
         ("nothing:", "valid: an Atari-57 game"),
         ("Catch:ball=2", "did you mean catch?"),
@@ -114,6 +115,10 @@ def test_a_list_that_was_cut_at_commas():
     assert envs.several(["Pong", "3"]) == ["Pong", "BattleZone", "NameThisGame", "Phoenix"]
     with pytest.raises(SpecError, match="^--games=Pang: did you mean Pong"):
         envs.several(["Pang"])
+    # A plug-in may bring along what is not known here, and no more.
+    assert envs.several(["mine", "catch", "catch:ball=3"], others=True) == ["mine", "Catch"]
+    with pytest.raises(SpecError, match="^--games=catch:bal=2: catch has no option"):
+        envs.several(["catch:bal=2"], others=True)
     with pytest.raises(SpecError, match=r"^--games=7: valid: .* suite .*\(26, 5, 3, signed, thesis\)"):
         envs.several(["7"])
 

@@ -138,6 +138,16 @@ def test_it_is_loaded_without_the_run(run, exported, tmp_path):
         assert identical(params, loaded.params["encoder"]) and loaded.env_steps == env_steps
         x = np.random.default_rng(0).integers(0, 256, (2, 42, 42, 4), dtype=np.uint8)
         np.testing.assert_allclose(jax.jit(encoder.apply)(params, x), loaded.encode(x), atol=1e-5)
+    for wrong, said in (
+        (x.astype(np.int32), r"not int32 \[2, 42, 42, 4\]"),
+        (x[0], r"\[B, 42, 42, 4\], not uint8 \[42, 42, 4\]"),
+        (x[:, :40], r"not uint8 \[2, 40, 42, 4\]"),
+    ):
+        for apply in (encoder.apply, jax.jit(encoder.apply)):
+            with pytest.raises(ValueError, match=said):
+                apply(params, wrong)
+    with pytest.raises(ValueError, match="give bytes as uint8"):
+        encoder.apply(params, x.astype(np.float32))
 
 
 def test_what_cannot_be_exported_is_refused_and_leaves_nothing(run, exported, tmp_path):

@@ -3,6 +3,9 @@
 import numpy as np
 import pytest
 
+from experiments.runs.collect import RunData
+from srl_jax.config import Config
+
 gallery = pytest.importorskip("experiments.reporting.gallery", reason="needs the extra plots")
 
 
@@ -15,3 +18,17 @@ def test_bands_of_few_runs_are_called_too_narrow(monkeypatch, seeds, narrow):
     (shown,) = gallery.profiles({"Catch": comparison}, {"rl": ("#000000", "-")}, None)
     assert shown.arms == ["rl"] * seeds
     assert [("too narrow" in text) for text in told] == [narrow]
+
+
+def test_what_an_objective_of_ones_own_says_is_drawn_with_its_loss(monkeypatch):
+    monkeypatch.setattr(gallery.pictures, "curves", lambda title, *_, **__: title)
+    config = Config(game="Catch", mode="joint", objectives=("mine:weight=2", "inverse"))
+    rows = [
+        {"kind": "train", "env_steps": step, "loss/mine": 1.0, "mine/share": 0.5, "replay/transitions": step}
+        for step in (100, 200)
+    ]
+    runs = [RunData("", "Catch", "a", 0, config, rows)]
+    prefixes = gallery.of_losses(runs)
+    assert prefixes == ["inverse/", "mine/", "rl/"]
+    shown = gallery.measured(runs, ["loss/", *prefixes], {"a": ("#000000", "-")})
+    assert [picture.picture for picture in shown] == ["loss: mine", "mine/share"]
