@@ -13,7 +13,13 @@ from srl_jax.files.metrics import read_metrics
 from srl_jax.run import loop
 from tests.helpers import optimised
 
-SHORT = {"steps": 24_000, "eval_every": 24_000, "eval_games": 200, "eps_anneal_steps": 8_000}
+SHORT = {
+    "diagnostics": False,
+    "steps": 24_000,
+    "eval_every": 24_000,
+    "eval_games": 200,
+    "eps_anneal_steps": 8_000,
+}
 
 
 def run(path, preset, **overrides):
