@@ -62,10 +62,13 @@ def drifts(arms: Arms, key: str = "diag/drift/cosine") -> dict[str, np.ndarray]:
 
 
 def _drift(run: RunData, key: str) -> float:
-    cosines = [row[key][-1] for row in run.rows if row.get(STEPS) and key in row]
-    if len(cosines) < 2:
-        raise ConfigError(f"{run.path}: has no {key}, which --diagnostics gives")
-    return 1.0 - float(np.mean(cosines[1:]))
+    rows = [row for row in run.rows if row.get(STEPS)][1:]
+    if not rows or not all(row.get(key) for row in rows):
+        raise ConfigError(f"{run.path}: has no {key}, which --diagnostics of this version gives")
+    cosines = [row[key][-1] for row in rows]
+    if None in cosines:
+        raise ConfigError(f"{run.path}: {key} is null at an evaluation: the latents were constant")
+    return 1.0 - float(np.mean(cosines))
 
 
 MEASURES: dict[str, Callable[[Arms], dict[str, np.ndarray]]] = {

@@ -100,7 +100,8 @@ def _defaults(names: Sequence[str]) -> dict[str, str]:
 
     return {
         f"objectives {row}: {option}": specs.value_text(value)
-        for row in rows & set(REGISTRY)
+        for row in rows
+        if row in REGISTRY
         for option, value in specs.option_defaults(REGISTRY[row]).items()
     }
 

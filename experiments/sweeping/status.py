@@ -233,7 +233,7 @@ def lines(root: Path, entries: Mapping[str, Entry], workers: int) -> list[str]:
         least = "at least " if unknown else ""
         parts.append(f"{least}{hms(seconds)} left" if seconds else "time left unknown")
         if seconds and unknown:
-            parts[-1] += f", without {unknown} of unknown speed"
+            parts[-1] += f", without those of unknown speed ({unknown})"
     rows = [("run", "env steps", "steps/s", "left", "evaluation", "by")]
     rows += [_row(root, entries[name], by) for name, (kind, by) in seen.items() if kind == "running"]
     told = [f"{name}: {kind}: {why}" for name, (kind, why) in seen.items() if kind != "running" and why]
@@ -297,7 +297,7 @@ def dry_run(
     if left:
         least = "at least " if seconds and unknown else ""
         line += f", {least}{hms(seconds) if seconds else 'unknown time'} with {workers} at once"
-        line += f", without {unknown} runs of unknown speed" if least else ""
+        line += f", without those of unknown speed ({unknown})" if least else ""
         line += "; each start takes up to a minute more" if seconds else ""
     lines.append(line)
     if unknown:

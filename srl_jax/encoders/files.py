@@ -73,8 +73,9 @@ def from_npz(path: str | os.PathLike[str]) -> tuple[Encoder, Params]:
         encoder, params = srl_jax.encoders.from_npz("enc.npz")
         latents = encoder.apply(params, observations)  # uint8 [B, H, W, S * C] -> float32 [B, D]
 
-    An encoder of your own has to be registered first, as by importing its file. Its `apply` raises ValueError
-    where observations have another shape or dtype, or are float32 beyond [0, 1].
+    An encoder of your own has to be registered first, as by importing its file. `apply` raises ValueError
+    where observations have another shape or dtype, or are float32 beyond [0, 1]; under jax.jit values are not
+    looked at.
 
     Raises:
         srl_jax.errors.ConfigError: there is no such file, or it is not what export writes, or does not fit

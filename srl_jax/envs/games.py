@@ -262,8 +262,9 @@ def _kinds(flag: str) -> str:
 def _instead(name: str, colon: str) -> str:
     """`did you mean X? `, or nothing."""
     stem = re.sub(r"(NoFrameskip|Deterministic)?-v\d+$", "", name.rpartition("/")[2])
-    whole, rows = specs.near(stem, NAMES), specs.near(stem, REGISTRY)
-    close = rows + whole if colon else whole + rows
+    # Of a name and a row that differ in capitals alone, Catch and catch, a row takes options.
+    ordered = [*NAMES, *REGISTRY] if colon else [*REGISTRY, *NAMES]
+    close = specs.near(stem, {name.lower(): name for name in ordered}.values())
     if not close and stem != name:
         close = [f"gymnasium:id={name}"]
     return f"did you mean {close[0]}? " if close else ""
@@ -322,12 +323,15 @@ def several(parts: Iterable[str], flag: str = "games", *, others: bool = False) 
         else:
             whole += SUITES.get(part.strip(), [part])
 
-    def known(text: str) -> bool:
-        return text.strip() in NAMES or text.strip().partition(":")[0] in REGISTRY
+    def name(text: str) -> str:
+        try:
+            return canonical(text, flag)
+        except specs.SpecError:
+            if others and text.strip().partition(":")[0] not in REGISTRY:
+                return text
+            raise
 
-    return list(
-        dict.fromkeys(text if others and not known(text) else canonical(text, flag) for text in whole)
-    )
+    return list(dict.fromkeys(map(name, whole)))
 
 
 def label(text: str) -> str:

@@ -88,6 +88,7 @@ class Report:
 
         Raises:
             ConfigError: a logger cannot be made, or metrics.jsonl is not what a checkpoint knows.
+            SaveError: it cannot be opened.
         """
         texts, config = self._config.loggers, json.loads(self._config.to_json())
         resumed = self._mark is not None

@@ -86,6 +86,7 @@ def test_a_name_of_its_own_is_canonical(name):
         ("MiniGrid-Empty-5x5-v0", "did you mean gymnasium:id=MiniGrid-Empty-5x5-v0?"),
         ("cath:ball=2", "did you mean catch?"),
         ("Ctach", "did you mean Catch?"),
+        ("Asterixx", "did you mean Asterix?"),
         ("", "valid: an Atari-57 game"),
         ("nothing:", "valid: an Atari-57 game"),
         ("Catch:ball=2", "did you mean catch?"),
@@ -117,6 +118,7 @@ def test_a_list_that_was_cut_at_commas():
         envs.several(["Pang"])
     # A plug-in may bring along what is not known here, and no more.
     assert envs.several(["mine", "catch", "catch:ball=3"], others=True) == ["mine", "Catch"]
+    assert envs.several(["my:E-v0"], others=True) == envs.several(["my:E-v0"]) == [envs.canonical("my:E-v0")]
     with pytest.raises(SpecError, match="^--games=catch:bal=2: catch has no option"):
         envs.several(["catch:bal=2"], others=True)
     with pytest.raises(SpecError, match=r"^--games=7: valid: .* suite .*\(26, 5, 3, signed, thesis\)"):

@@ -1,5 +1,6 @@
 import errno
 import hashlib
+import io
 
 import jax.numpy as jnp
 import numpy as np
@@ -118,15 +119,22 @@ def test_a_file_cut_anywhere_reads_up_to_the_cut_and_can_be_continued(tmp_path):
         assert [row["env_steps"] for row in read_metrics(path)] == [*range(whole), 9]
 
 
-@pytest.mark.parametrize("whole", [True, False])
-def test_a_file_that_cannot_be_opened_or_ended_is_named(tmp_path, monkeypatch, whole):
-    path = tmp_path / "metrics.jsonl"
-    path.write_text('{"kind": "train", "env_steps": 1}' + whole * "\n")
+class Full(io.FileIO):
+    """A file that is full."""
 
-    def full(file, mode="r", **options):
-        if mode != "rb":
+    def write(self, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("when", ["mended", "ended", "opened"])
+def test_a_file_that_cannot_be_opened_or_ended_is_named(tmp_path, monkeypatch, when):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"kind": "train", "env_steps": 1}')
+
+    def full(file, mode):
+        if when == {"r+b": "mended", "ab": "opened"}[mode]:
             raise OSError(errno.ENOSPC, "No space left on device")
-        return open(file, mode, **options)
+        return Full(file, "r+") if when == "ended" else open(file, mode)
 
     monkeypatch.setattr(metrics, "open", full, raising=False)
     with pytest.raises(SaveError, match=r"metrics.jsonl: not opened: No space left on device$"):

@@ -196,7 +196,7 @@ def test_an_update_of_rl_alone_takes_over_and_returns_only_what_it_moves():
     [
         *(("joint", encoder, "rainbow" if encoder == "tiny" else "dqn") for encoder in encoders.REGISTRY),
         *(("rl_only", "tiny", algorithm) for algorithm in rl.REGISTRY),
-        *((mode, "tiny", "dqn") for mode in MODES if mode not in ("joint", "rl_only")),
+        *((mode, "tiny", "rainbow") for mode in MODES if mode not in ("joint", "rl_only")),
     ],
 )
 def test_everything_is_float32_also_where_jax_may_use_64_bits(mode, encoder, algorithm):

@@ -91,6 +91,8 @@ def test_drift_is_to_the_encoder_before_from_the_second_on(measure):
     np.testing.assert_allclose(found["a"], [0.2])
     with pytest.raises(ConfigError, match=f"has no {key}"):
         criteria.MEASURES[measure]({"a": [run([], [0.1])]})
+    with pytest.raises(ConfigError, match=f"{key} is null"):
+        criteria.MEASURES[measure]({"a": [run([], [0.1], [0.2, None], [0.3, 0.4, 0.9])]})
 
 
 @pytest.mark.parametrize(

@@ -166,6 +166,7 @@ BAD = [
     (["--gane=Pong"], "--gane", "did you mean --gate or --game"),
     (["--lr=1"], "--lr: no such flag", "did you mean --lr_encoder or --lr_encoder_srl or"),
     (["--learning_rate=1"], "--learning_rate: no such flag", "did you mean --lr_rl or --lr_srl or"),
+    (["--the=1"], "--the: no such flag", "no such flag; --help lists them all"),
     (["Pong"], "'Pong'", "--name=value"),
     (["--nokeep_best=1"], "--nokeep_best=1", "argument"),
     (["--flagfile=/dev/zero"], "--flagfile", "write the flags themselves"),
