@@ -53,7 +53,7 @@ def test_parameter_counts_and_features_at_84_pixels(name, options, features, num
     assert (z.shape, z.dtype) == ((2, features), jnp.float32)
 
 
-SHAPES = [(84, 84, 4), (40, 40, 4), (42, 42, 4), (56, 56, 4), (64, 64, 12), (96, 96, 9), (41, 73, 6)]
+SHAPES = [(84, 84, 4), (40, 42, 4), (56, 64, 12), (96, 41, 9), (41, 73, 6)]
 
 
 @pytest.mark.parametrize(

@@ -261,7 +261,7 @@ def test_resume_refuses_what_is_no_run(tmp_path):
         resume.main(["resume"])
 
 
-SHORT = SMALL | {"steps": 600, "eval_every": 200}
+SHORT = SMALL | {"steps": 600, "eval_every": 200, "rl": "dqn:hidden=16"}
 RUN = [*(f"--{name}={value}" for name, value in SHORT.items()), "--tune_runtime=off"]
 
 

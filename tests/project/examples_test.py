@@ -25,7 +25,7 @@ pytestmark = pytest.mark.usefixtures("shared_agents")
 GAME = "examples.own_environment:Dot-v0"
 SMALL = {"steps": 240, "eval_every": 120, "log_every": 40, "eval_games": 2, "eval_max_steps": 100}
 SMALL |= {"buffer_size": 400, "learn_start": 40, "num_envs": 4, "batch_size": 8, "frame_size": 42}
-SMALL |= {"rl": "rainbow:hidden=16,atoms=11", "encoder": "tiny:features=8"}
+SMALL |= {"rl": "dqn:hidden=16", "encoder": "tiny:features=8"}
 
 
 @pytest.fixture(scope="module")
