@@ -34,8 +34,9 @@ def run(path, preset, **overrides):
 
 
 def test_joint(tmp_path):
-    # Half the preset's batch and half its frame, which is a third of the time.
-    rows, final = run(tmp_path / "joint", "catch/joint", batch_size=32, frame_size=42)
+    # A quarter of the preset's batch and half its frame, which is a quarter of the time. Seeds 0, 1 and 2 end
+    # at 0.12, -0.04 and 0.29.
+    rows, final = run(tmp_path / "joint", "catch/joint", batch_size=16, frame_size=42)
     assert final > -0.2
     losses = [row["loss/reconstruction"] for row in rows if "loss/reconstruction" in row]
     assert losses[-1] < 0.6 * losses[0]
