@@ -15,8 +15,9 @@ pytestmark = pytest.mark.usefixtures("shared_agents")
 
 CONFIG = dict(
     game="Catch", mode="joint", frame_size=42, encoder="tiny:features=8", objectives=("inverse",), num_envs=2,
-    rl="rainbow:hidden=8,atoms=5,v_min=-1,v_max=1,dueling=false", buffer_size=200, batch_size=4, updates_per_step=0.25,
-    learn_start=40, steps=120, eval_every=60, eval_games=2, log_every=20, slow_update_every=4, srl_every=2,
+    rl="rainbow:hidden=8,atoms=5,v_min=-1,v_max=1,dueling=false", buffer_size=200, batch_size=4,
+    updates_per_step=0.25, learn_start=40, steps=120, eval_every=60, eval_games=2, log_every=20,
+    slow_update_every=4, srl_every=2,
     reset="all", reset_every=60, n_anneal="3->1@5", gamma=0.99, gamma_anneal="0.9->0.99@5", weight_decay=0.1,
 )  # fmt: skip
 
