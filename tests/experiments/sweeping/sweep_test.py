@@ -233,14 +233,16 @@ def test_seeds_of_other_settings_are_no_seeds_of_an_arm_that_is_there(stubs):
     assert list(manifest.merged(stubs.root, same)) == [A, name]
 
 
-def test_a_directory_that_somebody_writes_to_is_waited_for(stubs, capsys):
+def test_a_directory_that_somebody_writes_to_is_waited_for(stubs, monkeypatch):
+    said = []  # not capsys, which loses what another thread writes while it is read
+    monkeypatch.setattr(launching, "say", said.append)
     other = subprocess.Popen(stubs.acts(b=["wait", "end"]).command(ALL[B].run), cwd=stubs.root)
     stubs.wait_for(B)
-    thread, said = threading.Thread(target=stubs.run, args=[B]), ""
+    thread = threading.Thread(target=stubs.run, args=[B])
     thread.start()
-    while f"{B}: waiting for process {other.pid} on here" not in said:
-        said += capsys.readouterr().err
+    while not any(f"{B}: waiting for process {other.pid} on here" in line for line in said):
         assert thread.is_alive()
+        time.sleep(0.01)
     other.terminate()
     thread.join()
     assert stubs.count() == [0, 2, 0] and stubs.seen()[B][0] == "done" and other.wait() == 143
