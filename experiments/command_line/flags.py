@@ -45,13 +45,16 @@ def unknown(name: str, known: Iterable[str]) -> str:
     """What is said of a flag that there is not: what may have been meant, or where its value has gone to."""
     if name in MOVED:
         return f"is now {MOVED[name]}"
-    known, words = set(known), re.compile(rf"\b{re.escape(name.replace('_', ' '))}\b")
-    of_help = [
-        info.flag or field for field, info in INFOS.items() if len(name) > 3 and words.search(info.help)
-    ]
-    meant = specs.near(name, known) or [flag for flag in of_help if flag in known]
-    close = " or ".join(f"--{flag}" for flag in meant[:5])
+    known = set(known)
+    meant = specs.near(name, known) or [flag for flag in _of_help(name) if flag in known][:5]
+    close = " or ".join(f"--{flag}" for flag in meant)
     return f"no such flag; {f'did you mean {close}? ' if close else ''}--help lists them all"
+
+
+def _of_help(name: str) -> list[str]:
+    """The flags whose help has these words, as learning_rate; none for a name of up to three letters."""
+    words = re.compile(rf"\b{re.escape(name.replace('_', ' '))}\b")
+    return [info.flag or field for field, info in INFOS.items() if len(name) > 3 and words.search(info.help)]
 
 
 class _Parser(flags.ArgumentParser):

@@ -16,9 +16,8 @@ import pytest
 from experiments import train
 from srl_jax.config import Config
 from srl_jax.files import checkpoint
-from srl_jax.files.metrics import read_metrics, strip_wall
 from srl_jax.files.provenance import git_revision
-from tests.helpers import last_of_each
+from tests import helpers
 from tests.in_process import parse
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -107,7 +106,7 @@ small_chunks = mock.patch("srl_jax.replay.CHUNK_BYTES", 200_000)
 
 def train_here(*arguments):
     """`experiments.train` in this process; returns its status, raises what it raises."""
-    return train.train(parse(train, *last_of_each(arguments)))
+    return train.train(parse(train, *helpers.last_of_each(arguments)))
 
 
 @pytest.fixture(scope="session")
@@ -122,7 +121,7 @@ def small_run(tmp_path_factory):
 def rows_of(run):
     """The rows of a run, or of its seeds, less what depends on the clock."""
     files = sorted([*run.glob("metrics.jsonl"), *run.glob("seed*/metrics.jsonl")])
-    return [strip_wall(row) for file in files for row in read_metrics(file)]
+    return [row for file in files for row in helpers.rows_of(file.parent)]
 
 
 def remains(run):
