@@ -17,11 +17,12 @@ os.environ.setdefault("QTWEBENGINE_CHROMIUM_FLAGS", "--disable-gpu --no-sandbox"
 pytest.importorskip("PySide6.QtWebEngineWidgets", reason="needs the extra soak", exc_type=ImportError)
 
 import shiboken6  # noqa: E402
-from PySide6.QtCore import QEventLoop, QTimer, QUrl  # noqa: E402
+from PySide6.QtCore import QEventLoop, Qt, QTimer, QUrl  # noqa: E402
 from PySide6.QtWebEngineWidgets import QWebEngineView  # noqa: E402
 from PySide6.QtWidgets import QApplication  # noqa: E402
 
 SCREEN = 1600
+ONCE = Qt.ConnectionType.SingleShotConnection
 CAMPAIGNS = sorted(path.parent for path in ROOT.glob("experiments/results/*/configs.json"))
 SEEN = """
 document.querySelectorAll("details").forEach(x => x.open = true);
@@ -63,7 +64,9 @@ def test_nothing_sticks_out_of_a_page(campaign, view, tmp_path, pytestconfig, re
     for width in (1280, 390):
         view.resize(width, SCREEN)
         view.show()
-        assert waited(lambda done: (view.loadFinished.connect(done), view.load(QUrl.fromLocalFile(page))))
+        assert waited(
+            lambda done: (view.loadFinished.connect(done, ONCE), view.load(QUrl.fromLocalFile(page)))
+        )
         seen = json.loads(waited(lambda done: view.page().runJavaScript(SEEN, 0, done)))
         if pictures := pytestconfig.getoption("pictures"):
             pictures.mkdir(parents=True, exist_ok=True)
