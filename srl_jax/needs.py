@@ -10,6 +10,7 @@ earlier run brings is not: it takes its default, so that config.json says what h
 """
 
 import dataclasses
+import functools
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -100,7 +101,7 @@ class Run(NamedTuple):
 
     def unread(self) -> Iterator[tuple[str, str]]:
         """(field, why nothing reads it), of each whose value is not the default."""
-        defaults = type(self.config)()
+        defaults = _defaults(type(self.config))
         for name, need in self.needs.items():
             default = getattr(defaults, name)
             changed = getattr(self.config, name) != default
@@ -128,7 +129,7 @@ class Run(NamedTuple):
 
     def in_force(self) -> "Config":
         """The configuration, with defaults where nothing reads what it has."""
-        run, defaults = self, type(self.config)()
+        run, defaults = self, _defaults(type(self.config))
         unread: dict[str, Any]
         while unread := {name: getattr(defaults, name) for name, _ in run.unread()}:
             config = dataclasses.replace(run.config, **unread)
@@ -152,3 +153,8 @@ class Run(NamedTuple):
         while unread := [option for option, _ in self.unread_options(spec)]:
             spec = spec.without(unread)
         return spec
+
+
+@functools.cache
+def _defaults(kind: type["Config"]) -> "Config":
+    return kind()

@@ -310,9 +310,9 @@ def check_arms(runs: Sequence[RunData]) -> None:
         for arm, members in arms.items():
             for line in _other_files(members):
                 display.say(f"{arm} on {game}: {line}")
-            for run in members[1:]:
-                one, other = (checks.run_of(x.config).in_force() for x in (members[0], run))
-                if differing := difference_in_meaning(one, other, OF_AN_ARM):
+            in_force = [checks.run_of(run.config).in_force() for run in members]
+            for run, config in zip(members[1:], in_force[1:], strict=True):
+                if differing := difference_in_meaning(in_force[0], config, OF_AN_ARM):
                     raise ConfigError(
                         f"{run.path}: of the same arm, {arm} on {game}, as {members[0].path}, but {differing}"
                     )

@@ -184,14 +184,16 @@ def check_rows(rows: list[dict], name: str) -> None:
             raise ConfigError(f"{name}, line {number}: env_steps is no count")
         for key, value in row.items():
             kind = key.partition("/")[0]
-            if key in ("eval/returns", "final/returns", STEPS):
-                good = isinstance(value, list) and all(map(_is_count if key == STEPS else _is_number, value))
+            if key == STEPS:
+                good = isinstance(value, list) and all(map(_is_count, value))
+            elif key in ("eval/returns", "final/returns"):
+                good = isinstance(value, list) and _are_numbers(value)
             elif kind == "diag" and isinstance(value, list):
-                good = all(map(_is_number, value))
+                good = _are_numbers(value)
             else:
                 means = ("eval/return_mean", "final/return_mean")
                 drawn = kind in ("loss", "grad_norm", "diag") or key in means
-                good = not drawn or _is_number(value)
+                good = not drawn or _are_numbers([value])
             if not good:
                 raise ConfigError(f"{name}, line {number}: {key} is not made of numbers of single precision")
     for kind in drift_names(rows):
@@ -205,6 +207,9 @@ def _is_count(value: Any) -> bool:
     return type(value) is int and 0 <= value <= LIMITS[int]
 
 
-def _is_number(value: Any) -> bool:
-    """Whether a value is a number that single precision holds, or null."""
-    return value is None or (type(value) in (int, float) and abs(value) <= LIMITS[float])
+def _are_numbers(values: list) -> bool:
+    """Whether all values are numbers that single precision holds, or null."""
+    most = LIMITS[float]
+    if not {*map(type, values)} <= {int, float, type(None)}:
+        return False
+    return all(-most <= value <= most for value in values if value is not None)

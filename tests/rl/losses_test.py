@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import rlax
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,6 +22,7 @@ from srl_jax.rl.losses import (
     quantile_q_learning,
     soft_policy,
 )
+from tests.references import rlax
 
 # rlax's categorical losses call a function of its own that it means to drop one day.
 pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:PendingDeprecationWarning")

@@ -6,7 +6,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-import rlax
 
 from srl_jax import rl
 from srl_jax.latents import named_key
@@ -17,6 +16,7 @@ from srl_jax.rl import values
 from srl_jax.rl.losses import n_step
 from srl_jax.types import Context, Latents, TrainState, Window
 from tests.helpers import count, random_params
+from tests.references import rlax
 from tests.rl.rl_test import (
     ACTIONS,
     ATOMS,

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-import rlax
 
 from srl_jax import plugins, rl, specs
 from srl_jax.rl import heads, values
 from srl_jax.types import Context, Latents, Window
 from tests.helpers import all_zero, make_encoder, random_params
 from tests.observed import of_algorithm
+from tests.references import rlax
 
 pytestmark = pytest.mark.filterwarnings("ignore:Rlax categorical_cross_entropy:PendingDeprecationWarning")
 

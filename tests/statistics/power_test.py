@@ -4,7 +4,6 @@ import shutil
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from experiments import power
 from srl_jax import data
@@ -12,6 +11,7 @@ from srl_jax.errors import ConfigError
 from srl_jax.statistics import MOST, runs_needed, smallest_effect, welch_p, welch_power
 from tests.helpers import NOT_FINITE, write_run
 from tests.in_process import parse
+from tests.references import stats
 
 
 def _lines(*arguments):

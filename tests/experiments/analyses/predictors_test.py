@@ -4,13 +4,13 @@ import json
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from experiments.analyses import predictors
 from experiments.analyses.populations import ChosenArm
 from experiments.analyses.predictors import Stratum
 from experiments.runs.run_data import load_run
 from tests.helpers import write_run
+from tests.references import stats
 
 KEY = "diag/effective_rank"
 
