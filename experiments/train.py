@@ -272,14 +272,16 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     check_paths(needed)
     check_sources(needed)
     config_flags.say_what_is_replaced(values)
+    new_end = not manifests[0] or manifests[0].config.steps != config.steps
     if dry:
         display.result(config.to_json())
         if config.reset != "none" or config.n_anneal or config.gamma_anneal:
             for line in printed(config, every=max(1, config.steps // 20)):
                 display.say(line)
         say_unused(values, config.game)
-        if not manifests[0]:
+        if new_end:
             say_last_evaluation(config)
+        if not manifests[0]:
             say_no_update(config)
         for (directory, _), manifest in zip(runs, manifests, strict=True):
             how = f"would resume from {manifest.env_steps} env steps" if manifest else "would begin"
@@ -293,8 +295,9 @@ def train(values: flags.FlagValues, prepare: Callable[[str, str], None] | None =
     say_unused(values, config.game)
     with contextlib.ExitStack() as stack:
         started = contextlib.ExitStack()  # what is to be done once the run has begun
-        if not manifests[0]:
+        if new_end:
             started.callback(say_last_evaluation, config)
+        if not manifests[0]:
             started.callback(say_no_update, config)
         if seeds and fresh:
             started.callback(stack.enter_context(run_directory(path, None)))

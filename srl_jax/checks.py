@@ -122,7 +122,10 @@ def _augments(run: Run) -> str:
 
 def _target_apart(run: Run) -> str:
     config = run.config
-    if config.target_encoder == "slow" or config.target_view not in ("same", "none"):
+    seen = config.srl_view or ("none" if config.augment == "none" else "shift")
+    mixes = float(specs.split(config.encoder)[1].get("lix", 0)) != 0.0  # by other draws of each
+    same = config.target_view == "same" or config.target_view == seen == "none"
+    if config.target_encoder == "slow" or mixes or not same:
         return ""
     return "with --target_encoder=online, where the target is the latent itself"
 

@@ -374,3 +374,15 @@ def test_what_is_said_of_earlier_runs_is_read_and_could_be_resumed(path):
         base = unresolved(config)  # as `--config` takes it
         wanted = completed(checks.check(base, given=(), complete=False))
         assert wanted == completed(config) == completed(wanted)
+
+
+@pytest.mark.parametrize("views", [{"srl_view": "shift"}, {"augment": "srl"}, {"encoder": "a_lix:lix=1"}])
+@pytest.mark.parametrize("target_view", ["none", "same", "shift"])
+def test_a_target_of_the_online_encoder_is_the_latent_itself_where_both_see_the_same(views, target_view):
+    config = Config(
+        **{**SMALL, **with_objectives("latent_l2:target=slow"), "target_encoder": "online", **views},
+        target_view=target_view,
+    )
+    apart = "encoder" in views or target_view != "same"
+    options = specs.split(resolved(config, ()).objectives[0])[1]
+    assert options["target"] == ("slow" if apart else "zero")

@@ -206,11 +206,14 @@ def check(texts: Sequence[str]) -> None:
     """Whether loggers can be made, as far as that is known before a run begins.
 
     Raises:
-        ConfigError: see `factory`; or one is given twice.
+        ConfigError: see `factory`; or one is given twice, or two of the same name.
     """
-    for text in texts:
+    for number, text in enumerate(texts):
         if texts.count(text) > 1:
             raise ConfigError(f"--logger={text}: given twice")
+        if other := next((other for other in texts[:number] if _key(other) == _key(text)), None):
+            raise ConfigError(f"--logger={text}: named as {other} is; rename one of the two")
+    for text in texts:
         factory(text)
 
 
@@ -304,7 +307,8 @@ def _own(text: str) -> tuple[str, str]:
 
 def _key(text: str) -> str:
     """A logger's name in `FILE`: the same where its file has moved."""
-    return text.rpartition("/")[2]
+    file, _, name = text.rpartition(":")
+    return f"{file.rpartition('/')[2]}:{name}" if file.endswith(".py") else text
 
 
 def _read(path: Path) -> dict[str, int]:

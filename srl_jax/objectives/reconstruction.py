@@ -20,9 +20,10 @@ def weighted_squared_error(output: Array, target: Array, weights: Array) -> jax.
 def change_weights(before: Array, now: Array, moving: float) -> jax.Array:
     """Weights of pixels, 1 where nothing moved and `1 + moving` where something did: [H, W, C] -> [H, W, C].
 
-    Something moved where a pixel of the two images differs by more than 1/255.
+    Something moved where a pixel of the two images differs by two of 255 levels of brightness or more, also
+    where an intensity view has scaled both.
     """
-    return 1.0 + moving * (jnp.abs(now - before) > 1 / 255).astype(jnp.float32)
+    return 1.0 + moving * (jnp.abs(now - before) > 1.5 / 255).astype(jnp.float32)
 
 
 def patch_mask(key: Array, height: int, width: int, share: float, side: int) -> jax.Array:

@@ -18,7 +18,7 @@ class Evaluation(NamedTuple):
         lengths: env steps of each game.
         frames: uint8 [T, H, W, C], the first environment's games as they were seen, one after the other;
             empty unless asked for.
-        cut: how many were cut after `max_steps`, before they had ended.
+        cut: how many were cut after `max_steps`, before they had terminated; by the environment, too.
     """
 
     returns: list[float]
@@ -75,11 +75,10 @@ def evaluate(
         stacks.push(frames)
         if len(recorded) < record and game[0] < games:
             recorded.append(frames[0].copy())
-        ended = terminated | truncated
-        over = ended | (length >= max_steps)
+        over = terminated | truncated | (length >= max_steps)
         if over.any():
             counts = over & (game < games)
-            cut += int((counts & ~ended).sum())
+            cut += int((counts & ~terminated & (length >= max_steps)).sum())
             returns[game[counts]], lengths[game[counts]] = score[counts], length[counts]
             played += int(counts.sum())
             game[over] += number

@@ -83,7 +83,8 @@ class Evaluations:
     Attributes:
         under_way: the evaluation that is; None where none is.
         games: the future of its games, and seconds.
-        best: the largest mean return so far; the final evaluation does not count.
+        best, last: the largest mean return so far, and that of the last evaluation, -inf where none has been;
+            the final evaluation does not count.
         recording: uint8 [T, H, W, C], the first games of the last evaluation; None before there is one.
     """
 
@@ -93,7 +94,7 @@ class Evaluations:
         self._config, self._agent, self._report, self._keep = config, agent, report, keep
         self.under_way: Evaluating | None = None
         self.games: Future[tuple[Evaluation | None, float]] | None = None
-        self.best = -np.inf
+        self.best = self.last = -np.inf
         self.recording: np.ndarray | None = None
         self.thread = yielding_threads("evaluation", 1)
         self._envs: dict[str, Any] = {}  # {kind: made when there is something to play}
@@ -137,17 +138,14 @@ class Evaluations:
             )
         return played, time.perf_counter() - began
 
-    def finish(self, env_steps: int) -> float:
-        """Waits for the evaluation under way and writes its row; keeps the best parameters.
+    def finish(self, env_steps: int) -> None:
+        """Waits for the evaluation under way, if one is, and writes its row; keeps the best parameters.
 
         Args:
             env_steps: of now, where the progress bar stands.
-
-        Returns:
-            Its mean return; -inf where none is under way.
         """
         if self.under_way is None or self.games is None:
-            return -np.inf
+            return
         played, seconds = self.games.result()
         assert played is not None  # only `leave` has them left
         (params, then, updates, values, kind), self.under_way = self.under_way, None
@@ -155,10 +153,10 @@ class Evaluations:
         mean = self._report.evaluation(kind, then, updates, played, seconds, values)
         if kind != FINAL:
             self._report.progress.update(env_steps, evaluation=mean)
+            self.last = mean
             if mean > self.best:
                 self.best = mean
                 self._keep(params, then, updates)
-        return mean
 
     def leave(self) -> None:
         """Has nobody wait for the games that are under way: they are left at their next step."""
@@ -172,10 +170,11 @@ class Evaluations:
     def snapshot(self) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         """What `restore` takes, as arrays and JSON values; less the parameters of the one under way."""
         arrays = {} if self.recording is None else {"recording": self.recording}
-        best = self.best if np.isfinite(self.best) else None
-        return arrays, {"best": best, "evaluating": self.under_way and self.under_way[1:]}
+        best, last = (mean if np.isfinite(mean) else None for mean in (self.best, self.last))
+        return arrays, {"best": best, "last": last, "evaluating": self.under_way and self.under_way[1:]}
 
     def restore(self, arrays: Mapping[str, np.ndarray], numbers: Mapping[str, Any]) -> None:
         """Goes on from there; none is under way."""
         self.recording = arrays["recording"] if "recording" in arrays else None
-        self.best = -np.inf if numbers["best"] is None else float(numbers["best"])
+        best, last = numbers["best"], numbers.get("last")  # which earlier versions did not keep
+        self.best, self.last = (-np.inf if mean is None else float(mean) for mean in (best, last))

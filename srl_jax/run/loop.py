@@ -226,7 +226,7 @@ class Run:
             for seed in self.seeds:
                 seed.evaluations.play()
         final = first.evaluations.final  # under way already, where it is resumed
-        while self.env_steps < config.steps and not final:
+        while self.env_steps < config.steps and not (final or self.reached()):
             if self.stopped():
                 return False
             log, evaluate, save = (
@@ -236,10 +236,11 @@ class Run:
             if (log or evaluate) and not self.played():  # its rows come before the next ones
                 return False
             self.step()
-            reached = (log or evaluate) and self.finish_evaluation()
+            if log or evaluate:
+                self.finish_evaluation()
             if log:
                 self.write_train_rows()
-            if reached:
+            if self.reached():
                 break
             save = save and self.env_steps < config.steps
             if save:
@@ -395,17 +396,18 @@ class Run:
         for seed, state in self.each(self.state):
             seed.start_evaluation(state, self.env_steps, self.updates, now)
 
-    def finish_evaluation(self) -> bool:
+    def finish_evaluation(self) -> None:
         """Waits for the evaluation that is under way, if one is, and writes its rows.
 
         Called before the next row is written, so that rows are in the same order however long games take.
-
-        Returns:
-            Whether all seeds have reached the return that ends the run.
         """
-        means = [seed.evaluations.finish(self.env_steps) for seed in self.seeds]
+        for seed in self.seeds:
+            seed.evaluations.finish(self.env_steps)
+
+    def reached(self) -> bool:
+        """Whether in the last evaluation all seeds had the return that ends the run."""
         wanted = self.config.stop_at_return
-        return wanted is not None and min(means) >= wanted
+        return wanted is not None and min(seed.evaluations.last for seed in self.seeds) >= wanted
 
     def save(self) -> None:
         """Writes checkpoints that can be resumed from, unless there are some of this moment."""
@@ -418,7 +420,7 @@ class Run:
     def keep_encoders(self) -> None:
         """Writes the encoders, if the checkpoint that is due is one of every `keep_encoder_every`."""
         every = self.config.keep_encoder_every
-        if every and self.env_steps // self.checkpoint_every % every == 0:
+        if every and self.env_steps // max(self.checkpoint_every, self.config.num_envs) % every == 0:
             self.fetch()
             for seed, params in self.each(self.state.params):
                 seed.keep({"encoder": params["encoder"]}, self.env_steps, self.updates)

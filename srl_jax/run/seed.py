@@ -214,12 +214,15 @@ class Seed:
             numbers = checkpoint.load_numbers(manifest)
             for part, (_, restore) in self.parts(manifest.env_steps).items():
                 restore(checkpoint.Arrays(manifest, f"{part}_"), numbers[part])
+            # What ended the run, or was the last of it, does not where it is extended.
+            extended = difference(manifest.config, self.config, ENDS)
+            if extended:
+                self.evaluations.last = -np.inf
             if evaluating := numbers["play"]["evaluating"]:
                 then = "params" if evaluating[0] == manifest.env_steps else "evaluating"
                 params = saving.params(self.agent, manifest, then)
                 under_way = Evaluating(params, *evaluating)
-                # One that was to be the last is not, where the run is extended.
-                if under_way.kind != FINAL or not difference(manifest.config, self.config, ENDS):
+                if under_way.kind != FINAL or not extended:
                     self.evaluations.under_way = under_way
         self.saved, self.saved_position = manifest, self.replay.next_position.copy()
         return state

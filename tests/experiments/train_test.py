@@ -113,6 +113,17 @@ def test_a_last_evaluation_before_the_end_is_said(capsys, loop, tmp_path, flags,
     assert (f"the last evaluation is after {last} env steps" in capsys.readouterr().err) == bool(last)
 
 
+def test_an_extended_run_says_it_too(capsys, loop, tmp_path):
+    resume = [*(x for x in CATCH if "--steps" not in x), f"--out={tmp_path / 'run'}", "--resume=auto"]
+    train_in_process(*resume, "--steps=500")
+    checkpoint_of(tmp_path / "run", 200)
+    for steps, said in ((500, False), (800, True), (1000, False)):
+        train_in_process(*resume, f"--steps={steps}", "--dry_run")
+        assert ("the last evaluation is after 500 of 800" in capsys.readouterr().err) == said
+    train_in_process(*resume, "--steps=800")
+    assert "the last evaluation is after 500 of 800" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("flags", "says"),
     [

@@ -85,6 +85,7 @@ def test_values_are_lists_and_options_have_commas_too(tmp_path, monkeypatch):
         (["csvv"], "--logger=csvv: no 'csvv'; did you mean csv? valid: tensorboard, wandb, csv"),
         (["wandb:projet=x"], "--logger=wandb:projet=x: wandb has no option 'projet'; did you mean project"),
         (["csv", "csv"], "--logger=csv: given twice"),
+        (["/a/mine.py:Mine", "/b/mine.py:Mine"], "--logger=/b/mine.py:Mine: named as /a/mine.py:Mine is"),
         (["nonesuch_module:A"], "--logger=nonesuch_module: ModuleNotFoundError: No module named"),
         (["json:Nonesuch"], "--logger=json:Nonesuch: json has no class Nonesuch"),
         (["json:__name__"], "--logger=json:__name__: json has no class __name__"),

@@ -52,6 +52,13 @@ def test_pixels_that_move_weigh_more_by_hand():
     assert float(error) == pytest.approx(4 / 7)
 
 
+@pytest.mark.parametrize("factor", [0.9, 1.0, 1.1])  # as an intensity view has them
+def test_one_level_of_brightness_is_no_motion_and_two_are(factor):
+    levels = np.float32(factor) * (np.arange(256, dtype=np.float32) / 255)[:, None, None]
+    assert (change_weights(levels[:-1], levels[1:], 3.0) == 1).all()
+    assert (change_weights(levels[:-2], levels[2:], 3.0) == 4).all()
+
+
 def test_a_frame_is_compared_with_the_one_before_it():
     window = make_window(horizon=1)
     stack = image(window, 0)

@@ -99,6 +99,13 @@ def test_an_endless_game_is_cut_with_its_score_as_it_stands():
     assert result.lengths == [4, 4, 1, 4] and result.cut == 1  # the others are of four steps by themselves
 
 
+@pytest.mark.parametrize(("max_steps", "cut"), [(4, 2), (5, 0)])
+def test_a_game_that_the_environment_cuts_in_the_same_step_counts_as_cut(max_steps, cut):
+    # As Atari does, whose limit of frames is that of --eval_max_steps.
+    result = play(Scripted([[[1.0] * 4, [1.0] * 4]], truncate=True), games=2, max_steps=max_steps)
+    assert result.lengths == [4, 4] and result.cut == cut
+
+
 @pytest.mark.parametrize("record", [1, 4, 5, 6, 100])
 def test_games_of_the_first_environment_are_recorded_from_their_first_frame_to_their_last(record):
     # Two games of it, of three and two steps; it goes on into a third one, which does not count.

@@ -196,6 +196,23 @@ def test_a_run_that_had_reached_its_return_has_ended_though_it_kept_its_replay(t
     assert not has_ended(path, manifest, dataclasses.replace(config, steps=400))
 
 
+def test_a_run_that_had_reached_its_return_and_was_killed_before_it_said_so_does_not_train_on(
+    tmp_path, monkeypatch
+):
+    path = tmp_path / "run"
+    with monkeypatch.context() as patch:
+        patch.setattr(loop, "pictures", lambda *_: 1 / 0)  # drawn behind the last checkpoint
+        with pytest.raises(ZeroDivisionError):
+            train(path, stop_at_return=-1.0, keep_replay=True)
+    manifest = whole(path)
+    assert not has_ended(path, manifest, manifest.config)
+    result = loop.train(manifest.config, path, resume=manifest)
+    assert result.env_steps == 40 and ending.read(path) == ("finished", 40, "")
+    # One that is extended has its end before it.
+    longer = dataclasses.replace(manifest.config, stop_at_return=None, steps=80)
+    assert loop.train(longer, path, resume=whole(path)).env_steps == 80
+
+
 def test_an_error_of_an_environment_in_the_middle_is_said(tmp_path, monkeypatch):
     step = Seed.step_env
 

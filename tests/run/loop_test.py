@@ -4,6 +4,7 @@ import json
 import re
 import shutil
 import time
+from types import SimpleNamespace
 
 import jax
 import numpy as np
@@ -22,7 +23,7 @@ from srl_jax.files.metrics import read_metrics
 from srl_jax.learning.modes import ENCODER_OPTIMIZERS
 from srl_jax.learning.update import Hyper
 from srl_jax.run import actor, loop
-from srl_jax.run.schedules import Schedules
+from srl_jax.run.schedules import Schedules, passed
 from srl_jax.types import Window
 from tests.helpers import JOINT, SMALL, one_run, rows_of, stop_after, whole
 from tests.in_process import parse
@@ -329,3 +330,16 @@ def test_a_run_makes_no_nan_on_the_way(form, tmp_path):
     assert any(row.get("grad_norm/encoder", 0) > 0 for row in rows)  # measured in some updates alone
     ratios = [row["step_ratio/encoder"] for row in rows if "step_ratio/encoder" in row]
     assert bool(ratios) == (form != "summed") and all(0.05 < ratio < 20 for ratio in ratios)
+
+
+@pytest.mark.parametrize("num_envs", [4, 40, 64, 80])
+def test_every_third_checkpoint_keeps_its_encoder_also_where_a_round_is_longer_than_between_two(num_envs):
+    config, kept, saved = Config(game="Catch", num_envs=num_envs, keep_encoder_every=3), [], []
+    seed = SimpleNamespace(keep=lambda parts, env_steps, updates: kept.append(env_steps))
+    run = SimpleNamespace(config=config, checkpoint_every=40, updates=0, fetch=lambda: None)
+    run.state, run.each = SimpleNamespace(params=None), lambda tree: [(seed, {"encoder": {}})]
+    for run.env_steps in range(num_envs, 2000, num_envs):
+        if passed(run.env_steps - num_envs, run.env_steps, 40):
+            saved.append(run.env_steps)
+            loop.Run.keep_encoders(run)
+    assert kept == saved[2::3] and len(kept) > 5
