@@ -24,7 +24,7 @@ from srl_jax.specs import choices_text, near
 from .command_line import paths
 from .command_line.flags import MOVED
 from .presets import preset_values
-from .sweeping.plan import arm_of
+from .sweeping.plan import OF_TRAINING, arm_of
 
 
 class FigureArm(NamedTuple):
@@ -211,8 +211,10 @@ def read_figure(path: Path) -> Figure:
         arms.append(FigureArm(arm["name"], arm["preset"], flags, curve))
     names = [arm.name for arm in arms]
     for name in (values["name"], *names):
-        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
-            raise refuse(f"name {name!r}: letters, digits, dots, dashes and underscores make a file's name")
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}", name):
+            raise refuse(
+                f"name {name!r:.120}: up to 100 letters, digits, dots, dashes and underscores make a name"
+            )
     if len(set(names)) < len(names):
         raise refuse("two arms have the same name")
     return Figure(
@@ -221,7 +223,8 @@ def read_figure(path: Path) -> Figure:
 
 
 def _flag_text(refuse: Any, number: int, flag: str, value: Any) -> str | tuple[str, ...]:
-    known = {info.flag or name: info.kind for name, info in INFOS.items()}
+    known: dict[str, type] = {info.flag or name: info.kind for name, info in INFOS.items()}
+    known |= dict.fromkeys(OF_TRAINING, str)
     if flag in MOVED:
         raise refuse(f"arm {number}: --{flag} is now {MOVED[flag]}")
     if flag not in known:

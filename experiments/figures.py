@@ -240,8 +240,9 @@ def define_flags(values: flags.FlagValues) -> None:
         "file, see experiments/arms.py",
     )
     names("presets", ["atari100k/der"], f"the arms of --figure={SCORES}, may have *")
-    names("games", ["Pong"], f"to run each arm on; {', '.join(envs.SUITES)} stand for suites of Atari games")
-    text("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,")
+    suites = f"{', '.join(envs.SUITES)} stand for suites of Atari games"
+    names("games", ["Pong"], f"to run each arm on; with --redraw all that are there; {suites}")
+    text("seeds", "3", "how many seeds, 5, or which ones: 0,3,7 or 3,; with --redraw all that are there")
     text("out", "runs/figures", "directory of runs and figures")
     text(
         "published",
@@ -291,9 +292,13 @@ def run(values: flags.FlagValues) -> int:
         own = (flag for flag in ("dry_run", *options.LAUNCHER, *given) if values[flag].present)
         if flag := next((flag for flag in own if flag != "import"), None):
             raise ConfigError(f"--{flag}: --redraw starts no run; leave one of them out")
-        if not values["seeds"].present:
+        if not (values["seeds"].present and values["games"].present):
             drawn = {arm.name for figure in figures for arm in figure.arms}
-            seeds = sorted({run.seed for run in collect.load_runs(root) if run.arm in drawn}) or seeds
+            there = [run for run in collect.load_runs(root) if run.arm in drawn]
+            if not values["games"].present:
+                games = sorted({run.game for run in there}) or games
+            if not values["seeds"].present:
+                seeds = sorted({run.seed for run in there if run.game in games}) or seeds
     runs = planned(figures, games, seeds, given)
     options.say_what_is_replaced(values, runs)
     text = values["published"].value
@@ -367,7 +372,8 @@ def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directo
     numbers = evaluated(figure, runs, games, **how)
     if not numbers["games"]:
         why = "".join(f"; {line}" for line in left_out_lines(numbers))
-        raise ConfigError(f"no evaluation of any arm of figure {figure.name} in {directory.parent}{why}")
+        where = f"on {', '.join(games)} in {directory.parent}"
+        raise ConfigError(f"no evaluation of any arm of figure {figure.name} {where}{why}")
     directory.mkdir(exist_ok=True)
     replace_text(directory / f"{figure.name}.json", json.dumps(numbers, indent=1) + "\n")
     return draw(figure, numbers, directory / f"{figure.name}.png")
@@ -405,7 +411,8 @@ def write_scores(
     )  # fmt: skip
     if not numbers["games"]:
         whys = (f"; {run['game']}, {run['arm']}: {run['reason']}" for run in numbers["left_out"][:3])
-        raise ConfigError(f"no score of any arm of figure {figure.name} in {directory.parent}{''.join(whys)}")
+        where = f"on {', '.join(games)} in {directory.parent}"
+        raise ConfigError(f"no score of any arm of figure {figure.name} {where}{''.join(whys)}")
     numbers["presets"] = {arm.name: arm.preset for arm in figure.arms}
     directory.mkdir(exist_ok=True)
     name = directory / figure.name

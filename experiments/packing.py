@@ -31,7 +31,7 @@ from srl_jax.run.ending import Ending
 
 from .command_line import flags as config_flags
 from .command_line import paths
-from .runs.run_data import RunData, check_rows, in_order, is_seed, load_run, run_directories
+from .runs.run_data import RunData, check_arm, check_rows, in_order, is_seed, load_run, run_directories
 
 CONFIGS = "configs.json"
 """[{"arm": its name, "config": the fields that its runs on a game share, "runs": [{"path": below the folder,
@@ -68,7 +68,7 @@ def read(folder: Path, *, only_last: bool = False, mend: bool = False) -> list[R
         try:
             config = Config.from_values(about)
             ended = Ending(**run["ended"]) if run["ended"] else None
-            below = Path(run["path"])
+            below, arm = Path(run["path"]), check_arm(arm, path)
             if below.is_absolute() or ".." in below.parts:
                 raise TypeError(f"{below} is not below the folder")
         except (KeyError, TypeError) as error:
@@ -284,6 +284,8 @@ def main(values: flags.FlagValues) -> None:
     for name in ("runs", "out"):
         if not values[name].value:
             raise ConfigError(f"--{name}: missing; name a directory")
+    if values.unpack and values.stopped:
+        raise ConfigError("--stopped: --unpack makes all runs that are packed; leave it out")
     runs, out = paths.given("runs", values.runs), paths.check_place("out", values.out)
     if not runs.is_dir():
         raise ConfigError(f"--runs={values.runs}: no such directory")

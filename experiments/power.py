@@ -176,14 +176,17 @@ def report(values: flags.FlagValues) -> list[str]:
     source, given, arms = values["from"].value, values["spread"].value, values["arm"].value
     if bool(source) == bool(given):
         raise ConfigError("--spread or --from: give one of them, --spread=0.12 or --from=DIRECTORY")
+    if values["force"].value and source in ("", PUBLISHED):
+        raise ConfigError("--force: only beside --from=DIRECTORY, whose runs may differ")
     if given:
         own = [_positive(text, given) for text in given]
-        if len(own) > 2 or arms or values["game"].value:
+        if len(own) > 2 or arms or values["game"].present:
             raise ConfigError(f"--spread={','.join(given)}: one or two numbers, without --game and --arm")
         return table("", [("", 0, (own[0], own[-1]))], effect, seeds, power)
     if len(arms) not in (0, 2):
         raise ConfigError(f"--arm={arms[0]}: give it twice, for the two arms, or not at all")
-    game = envs.canonical(values["game"].value) if values["game"].value else None
+    text = values["game"].value
+    (game,) = envs.several([text], "game", others=source != PUBLISHED) if text is not None else (None,)
     if source != PUBLISHED:
         found = of_runs(paths.given("from", source), game, force=values["force"].value)
     elif game and (spreads := of_published(game)):

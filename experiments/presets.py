@@ -6,15 +6,16 @@ after the other: `PIECES`, `objective/NAME`, or presets. The thesis is Guberina 
 arms keep their names here.
 """
 
+import contextlib
 import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from srl_jax import checks
+from srl_jax import checks, envs
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.learning.modes import GATES, MODES, PROJECTING, both_train
-from srl_jax.specs import choices_text, join, split
+from srl_jax.specs import SpecError, choices_text, join, split
 
 from .protocols import PROTOCOLS, PROTOCOLS_HELP
 
@@ -409,7 +410,8 @@ def preset_values(name: str, game: str | None = None) -> dict[str, Any]:
             values = piece(values)
         except ConfigError as error:
             raise ConfigError(f"{name}: {part}: {error}") from None
-    game = game or values["game"]
+    with contextlib.suppress(SpecError):  # a game of a plug-in that is not imported yet
+        game = envs.canonical(game or values["game"])
     whole = first.startswith("thesis/") and "small" not in rest
     if whole and values["mode"] != "pretrain" and game in _SOLVED:
         values["stop_at_return"] = _SOLVED[game]

@@ -20,6 +20,7 @@ from srl_jax import envs
 from srl_jax.errors import ConfigError, saving
 from srl_jax.files import display, rundir
 
+from . import packing
 from .command_line import flags as config_flags
 from .command_line import paths
 from .runs import collect
@@ -92,6 +93,8 @@ def main(values: flags.FlagValues) -> int:
         for name in ("presets", "games", "seeds", "grid", "dry_run", *options.given_flags(values)):
             if values[name].present:
                 raise ConfigError(f"--{name}: --status tells of the sweep that is in --out; leave it out")
+    if packing.is_packed(root):
+        raise ConfigError(f"--out={values.out}: runs are packed there; name another directory")
     how = options.launcher_options(values)
     workers = how["workers"] or launching.most_workers(how["cpus_per_run"])
     if values.status:

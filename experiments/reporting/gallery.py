@@ -222,7 +222,8 @@ def _curve(run: RunData, key: str, place: int) -> tuple[np.ndarray, np.ndarray]:
     points = []
     for row in run.rows:
         if row.get(key) not in (None, []):
-            value = row[key][place] if isinstance(row[key], list) else numbers.value_of(run, row, key)
+            value = row[key][place] if isinstance(row[key], list) else row[key]
+            value = numbers.value_of(run, {key: value}, key)
             points += [(row["env_steps"], value)] if value is not None else []
     return np.array([p[0] for p in points], np.int64), np.array([p[1] for p in points], np.float64)
 

@@ -94,7 +94,7 @@ class Game(NamedTuple):
             rows = [row for run in runs for row in run.rows if row.get(collect.FINAL) is not None]
             if rows:
                 means = {self.name: np.array([row[collect.FINAL] for row in rows], float)}
-                games = " or ".join(map(str, sorted({row.get("final/games", "?") for row in rows})))
+                games = " or ".join(map(str, sorted({row.get("final/games", "?") for row in rows}, key=str)))
                 steps = " or ".join(f"{n:,}" for n in sorted({row["env_steps"] for row in rows}))
                 told = f"{games} games of each of {len(rows)} seeds after {steps} env steps"
                 found[arm] = statistics.estimate(statistics.mean, means), told

@@ -78,6 +78,17 @@ def arm_name(path: Path) -> str:
     return re.sub(r"_seed\d+$", "", path.name)
 
 
+def check_arm(arm: str, path: Path) -> str:
+    """The name of an arm, as it is.
+
+    Raises:
+        ConfigError: it has a character that tables and figures cannot show.
+    """
+    if odd := next((character for character in arm if not character.isprintable()), ""):
+        raise ConfigError(f"{path}: {arm!a} has the character {odd!a}; name the arm with printable ones")
+    return arm
+
+
 def load_run(path: Path) -> RunData:
     """Reads a run directory.
 
@@ -87,7 +98,8 @@ def load_run(path: Path) -> RunData:
     its, about = config.read(path)
     metrics = path / "metrics.jsonl"
     rows = read_rows(metrics) if metrics.exists() else []
-    return RunData(path, its.game, arm_name(path), its.seed, its, rows, ending.read(path), about)
+    arm = check_arm(arm_name(path), path)
+    return RunData(path, its.game, arm, its.seed, its, rows, ending.read(path), about)
 
 
 def runs_below(root: Path, file: str = "config.json") -> list[Path]:
@@ -184,7 +196,9 @@ def check_rows(rows: list[dict], name: str) -> None:
             raise ConfigError(f"{name}, line {number}: env_steps is no count")
         for key, value in row.items():
             kind = key.partition("/")[0]
-            if key == STEPS:
+            if key == "final/games":
+                good = _is_count(value)
+            elif key == STEPS:
                 good = isinstance(value, list) and all(map(_is_count, value))
             elif key in ("eval/returns", "final/returns"):
                 good = isinstance(value, list) and _are_numbers(value)

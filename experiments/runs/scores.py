@@ -73,7 +73,8 @@ def end_score(run: RunData) -> tuple[Score | None, str]:
         steps, values = collect.steps_and_values(run, f"{kind}/return_mean")
         if len(steps) and steps[-1] == done:
             counts = collect.steps_and_values(run, games)[1] if games else [run.config.eval_games]
-            return Score(float(values[-1]), int(counts[-1]), kind == "final"), ""
+            number = int(counts[-1]) if len(counts) else run.config.final_games
+            return Score(float(values[-1]), number, kind == "final"), ""
     return None, f"not evaluated at its end, after {done:,} env steps"
 
 

@@ -26,6 +26,9 @@ PRETRAIN_SHARE = 0.3
 SOURCES = {"encoder_from": ENCODER_PRESETS, "policy_from": POLICY_PRESETS}
 """{flag that names a run to start from: {preset that needs one: preset of that run}}."""
 
+OF_TRAINING = ("protocol", "tune_runtime")
+"""Flags of training that an arm may have and that are no fields of Config."""
+
 OWN = {
     "game": "games",
     "seed": "seeds",
@@ -89,7 +92,7 @@ def grid(arms: Sequence[Arm], texts: Sequence[str], flags: Flags) -> list[Arm]:
     Raises:
         ConfigError: one is not that, or no flag of training, or the flag is there already.
     """
-    known = [*(info.flag or name for name, info in INFOS.items()), "protocol"]
+    known = [*(info.flag or name for name, info in INFOS.items()), *OF_TRAINING]
     axes: dict[str, list[str]] = {}
     for text in texts:
         flag, _, rest = text.partition("=")

@@ -57,6 +57,14 @@ GOOD = {
 }
 
 
+def test_an_arm_may_have_any_flag_of_training(tmp_path):
+    flags = {"protocol": "machado", "tune_runtime": "off", "life_loss": False}
+    path = tmp_path / "mine.json"
+    path.write_text(json.dumps({"name": "mine", "arms": [{"name": "a", "preset": "demo", "flags": flags}]}))
+    (figure,) = arms.figures_named(str(path))
+    assert figure.arms[0].flags == flags | {"life_loss": "false"}
+
+
 def test_a_figure_of_ones_own(tmp_path):
     path = tmp_path / "mine.json"
     path.write_text(json.dumps(GOOD))
@@ -71,7 +79,8 @@ def test_a_figure_of_ones_own(tmp_path):
 @pytest.mark.parametrize(
     "change, told",
     [
-        ({"name": "../x"}, "name '../x': letters"),
+        ({"name": "../x"}, "name '../x': up to 100 letters"),
+        ({"name": "x" * 101}, f"name '{'x' * 101}': up to 100 letters"),
         ({"arms": []}, "the figure has no 'arms'"),
         ({"arm": []}, "the figure has no 'arm'; did you mean arms?"),
         ({"title": 3}, "title of the figure is not of type str"),

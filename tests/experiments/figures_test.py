@@ -283,8 +283,8 @@ def test_what_is_there_is_drawn_again_and_nothing_run(runs, capsys):
         "joint_256": [0, 1],
     }
 
-    # Without --seeds all that are there are drawn.
-    assert _run("--figure=6.3", "--games=Catch", "--redraw", f"--out={runs}") == 0
+    # Without --games and --seeds all that are there are drawn.
+    assert _run("--figure=6.3", "--redraw", f"--out={runs}") == 0
     every = json.loads((runs / "figures" / "6.3.json").read_text())["games"]["Catch"]["arms"]
     assert {arm: values["seeds"] for arm, values in every.items()} == {
         "rl_only_nature": [0, 1],
@@ -326,7 +326,7 @@ def test_where_all_runs_failed_the_status_says_so(tmp_path, monkeypatch, capsys)
         out, err = capsys.readouterr()
         *gone, last = err.splitlines(keepends=True)
         assert gone == [GONE.format(arm, 2, 2, "0, 1") for arm in ("joint_256", "joint_50") if made]
-        assert out == "" and last.startswith(f"no evaluation of any arm of figure 6.3 in {tmp_path}")
+        assert out == "" and last.startswith(f"no evaluation of any arm of figure 6.3 on Catch in {tmp_path}")
         assert not (tmp_path / "figures").exists()
 
 

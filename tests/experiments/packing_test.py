@@ -264,6 +264,7 @@ def test_the_command_line(root, tmp_path, capsys):
         ([root, f"--out={root / 'alone_seed10/config.json'}"], "exists and is not a directory"),
         ([root, f"--out={tmp_path / 'new'}", "--unpack"], "configs.json: No such file"),
         ([tmp_path / "out", f"--out={tmp_path / 'out'}", "--unpack"], "name a folder that is neither"),
+        ([tmp_path / "out", f"--out={tmp_path / 'new'}", "--unpack", "--stopped"], "^--stopped: --unpack"),
     ):
         with pytest.raises(ConfigError, match=why):
             main(*arguments)

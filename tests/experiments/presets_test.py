@@ -142,6 +142,8 @@ def test_frames_for_pretraining_come_from_a_run_that_fits():
 
 def test_only_pong_of_the_thesis_games_stops_early():
     assert preset_values("thesis/joint_256")["stop_at_return"] == 20
+    for pong in ("Pong", "atari", "atari:game=Pong", " Pong"):  # which all mean the same
+        assert preset_values("thesis/joint_256", pong)["stop_at_return"] == 20
     assert "stop_at_return" not in preset_values("thesis/joint_256", "Breakout")
     assert "stop_at_return" not in preset_values("thesis/pretrain_256")
     assert "stop_at_return" not in PRESETS["thesis/joint_256"]

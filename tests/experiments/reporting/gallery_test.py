@@ -1,10 +1,13 @@
 """Tests of experiments.reporting.gallery."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from experiments.runs.collect import RunData
 from srl_jax.config import Config
+from srl_jax.errors import ConfigError
 
 gallery = pytest.importorskip("experiments.reporting.gallery", reason="needs the extra plots")
 
@@ -32,3 +35,11 @@ def test_what_an_objective_of_ones_own_says_is_drawn_with_its_loss(monkeypatch):
     assert prefixes == ["inverse/", "mine/", "rl/"]
     shown = gallery.measured(runs, ["loss/", *prefixes], {"a": ("#000000", "-")})
     assert [picture.picture for picture in shown] == ["loss: mine", "mine/share"]
+
+
+@pytest.mark.parametrize("value", ["x", ["x"], [[1.0]], [1e39]])
+def test_what_is_no_number_is_named(value):
+    rows = [{"kind": "train", "env_steps": 100, "rl/q_max_mean": value}]
+    runs = [RunData(Path("runs/a"), "Catch", "a", 0, Config(game="Catch"), rows)]
+    with pytest.raises(ConfigError, match="^runs/a/metrics.jsonl: rl/q_max_mean is not a number of single"):
+        gallery.measured(runs, ["rl/"], {"a": ("#000000", "-")})

@@ -42,6 +42,7 @@ def test_rows_as_training_writes_them(tmp_path):
         ({"diag/drift/cka": [0.5, [1.0]]}, "diag/drift/cka"),
         ({"diag/drift/steps": [1.5]}, "diag/drift/steps"),
         ({"diag/drift/steps": 5}, "diag/drift/steps"),
+        ({"final/games": [1]}, "final/games"),
     ],
 )
 def test_other_rows_are_refused_with_their_line(change, reason, tmp_path):
@@ -86,6 +87,14 @@ def test_runs_behind_links_are_found_and_loops_end(tmp_path):
     (tmp_path / "link").symlink_to(root)
     assert run_data.runs_below(tmp_path / "link")[0] == tmp_path / "link/joint_seed0"
     assert run_data.runs_below(root / "joint_seed1") == [root / "joint_seed1"]
+
+
+@pytest.mark.parametrize("name", ["n\udcff", "two\nlines"])
+def test_an_arm_that_cannot_be_shown_is_refused(name, tmp_path):
+    write_run(tmp_path / name / "seed0", (0.0, 1.0))
+    with pytest.raises(ConfigError) as error:
+        run_data.load_run(tmp_path / name / "seed0")
+    assert f"{name!a} has the character" in str(error.value)
 
 
 def test_runs_come_in_the_order_of_their_numbers(tmp_path):

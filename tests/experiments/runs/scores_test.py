@@ -243,7 +243,7 @@ def test_the_figure_is_the_same_from_packed_runs_byte_for_byte(runs, tmp_path, c
         (["--games=Catch"], "--games=Catch: published scores of --figure=atari100k are of Atari games"),
         (["--presets=atari100k/deer"], "--presets=atari100k/deer: did you mean atari100k/der?"),
         (["--games=Pong", "--published=DER"], "--published=DER: did you mean "),
-        (["--games=Pong", "--redraw", "--seeds=1,"], "no score of any arm of figure atari100k in "),
+        (["--games=Pong", "--redraw", "--seeds=1,"], "no score of any arm of figure atari100k on Pong in "),
         (["--figure=6.3,atari100k"], "--figure=6.3,atari100k: "),
         (["--figure=6.3", "--presets=demo"], "--presets: only --figure=atari100k takes it"),
     ],

@@ -38,6 +38,13 @@ def test_command_lines_that_are_refused(tmp_path, arguments, says):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_a_folder_of_packed_runs_takes_no_others(tmp_path):
+    (tmp_path / "configs.json").write_text("[]")
+    values, _ = _main("--presets=small/joint_256", f"--out={tmp_path}")
+    with pytest.raises(ConfigError, match="runs are packed there; name another"):
+        sweep.main(values)
+
+
 def test_the_status_writes_nothing_and_may_be_asked_where_nothing_can_be_written(tmp_path, monkeypatch):
     monkeypatch.setattr(
         sweep.paths, "check_place", lambda *_: pytest.fail("--status asks whether it may write")
