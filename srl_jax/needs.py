@@ -101,7 +101,7 @@ class Run(NamedTuple):
 
     def unread(self) -> Iterator[tuple[str, str]]:
         """(field, why nothing reads it), of each whose value is not the default."""
-        defaults = _defaults(type(self.config))
+        defaults = _defaults()
         for name, need in self.needs.items():
             default = getattr(defaults, name)
             changed = getattr(self.config, name) != default
@@ -129,7 +129,7 @@ class Run(NamedTuple):
 
     def in_force(self) -> "Config":
         """The configuration, with defaults where nothing reads what it has."""
-        run, defaults = self, _defaults(type(self.config))
+        run, defaults = self, _defaults()
         unread: dict[str, Any]
         while unread := {name: getattr(defaults, name) for name, _ in run.unread()}:
             config = dataclasses.replace(run.config, **unread)
@@ -156,5 +156,7 @@ class Run(NamedTuple):
 
 
 @functools.cache
-def _defaults(kind: type["Config"]) -> "Config":
-    return kind()
+def _defaults() -> "Config":
+    from srl_jax.config import Config
+
+    return Config()
