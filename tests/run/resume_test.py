@@ -267,7 +267,7 @@ OF_A_RUN = {
     "of the process": {"env_threads", "begun"},
 }  # fmt: skip
 OF_EVALUATIONS = {
-    "in parts": {"under_way", "best", "recording"},
+    "in parts": {"under_way", "best", "last", "recording"},
     "of the process": {"games", "thread", "_envs"},
     "of the configuration": {"_config", "_agent", "_report", "_keep"},
 }
