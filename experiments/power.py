@@ -186,7 +186,7 @@ def report(values: flags.FlagValues) -> list[str]:
     if len(arms) not in (0, 2):
         raise ConfigError(f"--arm={arms[0]}: give it twice, for the two arms, or not at all")
     text = values["game"].value
-    (game,) = envs.several([text], "game", others=source != PUBLISHED) if text is not None else (None,)
+    (game,) = envs.several([text], "game", others=source != PUBLISHED) if text else (None,)
     if source != PUBLISHED:
         found = of_runs(paths.given("from", source), game, force=values["force"].value)
     elif game and (spreads := of_published(game)):

@@ -88,7 +88,7 @@ def test_the_spread_of_runs_is_that_of_their_area(tmp_path, capsys):
     assert _lines(f"--from={tmp_path}", "--effect=2", "--game=CatchDistractor")[1][2] == "0"
     shutil.rmtree(tmp_path / "CatchDistractor")
     head, *rows = _lines(f"--from={tmp_path}", "--effect=2")
-    assert head[0] == "Catch"
+    assert head[0] == "Catch" and _lines(f"--from={tmp_path}", "--effect=2", "--game=") == [head, *rows]
     assert [row[:3] for row in rows[:2]] == [["a", "3", "1"], ["b", "3", "3"]]
     assert rows[2][:4] == ["all", "arms", "6", f"{5**0.5:.3g}"] and len(rows) == 3
     assert rows[0][-1] == str(runs_needed(2, (1, 1)))
