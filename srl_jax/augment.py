@@ -8,6 +8,7 @@ import jax.numpy as jnp
 
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
+from srl_jax.learning import modes
 from srl_jax.plugins import Registry
 from srl_jax.specs import choices_text
 from srl_jax.types import Array, Window
@@ -194,7 +195,7 @@ class Views(NamedTuple):
 
     @classmethod
     def of(cls, config: Config) -> "Views":
-        """The views of a run: --rl_view and --srl_view where they are given, else what --augment says.
+        """The views of a run: see `modes.views`.
 
         Raises:
             ConfigError: there is no such view; one line that names the flag.
@@ -206,9 +207,7 @@ class Views(NamedTuple):
                     make_seen(text)
             except ValueError as error:
                 raise ConfigError(f"--{flag}={text}: {error}") from None
-        rl = config.rl_view or ("shift" if config.augment == "all" else "none")
-        srl = config.srl_view or ("none" if config.augment == "none" else "shift")
-        return cls(rl, srl, config.target_view or "same")
+        return cls(*modes.views(config), config.target_view or "same")
 
 
 UNCHANGED = Views()

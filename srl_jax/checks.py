@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 from srl_jax import specs
 from srl_jax.errors import ConfigError
-from srl_jax.learning import annealing
+from srl_jax.learning import annealing, modes
 from srl_jax.learning.modes import MODES, PROJECTING, Mode, both_train, of, ratios, two_optimizers
 from srl_jax.needs import EVERYTHING, UNKNOWN, Run
 from srl_jax.replay import least_capacity
@@ -122,7 +122,7 @@ def _augments(run: Run) -> str:
 
 def _target_apart(run: Run) -> str:
     config = run.config
-    seen = config.srl_view or ("none" if config.augment == "none" else "shift")
+    _, seen = modes.views(config)
     mixes = float(specs.split(config.encoder)[1].get("lix", 0)) != 0.0  # by other draws of each
     same = config.target_view == "same" or config.target_view == seen == "none"
     if config.target_encoder == "slow" or mixes or not same:

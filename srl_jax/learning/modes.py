@@ -96,6 +96,12 @@ def two_optimizers(config: "Config") -> bool:
     return both_train(of(config)) and config.encoder_optimizer != "summed"
 
 
+def views(config: "Config") -> tuple[str, str]:
+    """What RL and the objectives see: --rl_view and --srl_view, or what --augment stands for."""
+    rl = config.rl_view or ("shift" if config.augment == "all" else "none")
+    return rl, config.srl_view or ("none" if config.augment == "none" else "shift")
+
+
 def ratios(config: "Config") -> list[str]:
     """The objectives whose weight is a ratio, as they are written."""
     return [text for text in config.objectives if specs.has_ratio(text)]

@@ -14,10 +14,10 @@ from srl_jax.replay import Replay
 from tests import helpers
 from tests.soak.conftest import train_here
 
+OF_PARAMETERS = 150e6
+"""Bytes that a checkpoint may have beside the frames: four trees of 20 MB, rewards and priorities."""
 MAY_GROW = 6e6
 """Bytes that resident memory may have grown by, from a third of the run to its end: malloc wanders."""
-SHARE, SECONDS = 0.02, 30.0
-"""The goals: the share of a run's time that checkpoints take, and the time until a run is resumed."""
 
 
 def resident():
@@ -74,8 +74,11 @@ def test_memory_does_not_grow_once_the_buffer_is_full(tmp_path, amount, progress
     assert grown < MAY_GROW
 
 
-def test_checkpoints_and_resuming_are_cheap(tmp_path, amount, progress, record_property):
-    """Of a full buffer: Pong, nature, thesis settings; its real env steps are filled in with few updates."""
+def test_what_checkpoints_and_resuming_cost(tmp_path, amount, progress, record_property):
+    """Of a full buffer: Pong, nature, thesis settings; its real env steps are filled in with few updates.
+
+    The goals are under 2 % of a run's time and under 30 s; they depend on the machine, and so are told.
+    """
     every = amount("buffer") // 2
     steps = 4 * every
     config = Config(**preset_values("thesis/rl_only_nature", None))
@@ -113,9 +116,9 @@ def test_checkpoints_and_resuming_are_cheap(tmp_path, amount, progress, record_p
     save = float(np.median(saves))
     share = save / (save + every / rate)
     record_property("a checkpoint", f"{save:.2f} s every {every:,} env steps at {rate:.0f} a second")
-    record_property("share of the time", f"{100 * share:.2f} %")
+    record_property("share of the time", f"{100 * share:.2f} %, goal 2 %")
     record_property("bytes of a checkpoint", size)
-    record_property("resumed in", f"{resumed:.1f} s")
-    assert resumed < SECONDS
-    if amount("buffer") >= 100_000:  # between the checkpoints of a smaller one there is little to do
-        assert share < SHARE
+    record_property("resumed in", f"{resumed:.1f} s, goal 30 s")
+    # Each frame is in it once, although a window has many.
+    frames = full.buffer_size * full.frame_size**2
+    assert frames < size < 1.1 * frames + OF_PARAMETERS
