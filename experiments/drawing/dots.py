@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..runs.scores import FAR
-from .plots import new_figure, plain, save
+from .plots import head, new_figure, plain, save
 
 GREY = "#8c8c8c"
 MARKERS = ("D", "s", "^", "v", "P")
@@ -78,7 +78,7 @@ def draw(numbers: Mapping[str, Any], path: str | os.PathLike) -> Path:
     )  # fmt: skip
     for text in (legend.get_title(), *legend.get_texts()):
         text.set_parse_math(False)
-    figure.suptitle(numbers["title"], fontsize=11).set_parse_math(False)
+    head(figure, numbers["title"])
     return save(figure, path)
 
 

@@ -63,7 +63,7 @@ def image_panel(
     bar = figure.colorbar(drawn, ax=axes, fraction=0.04, pad=0.02, aspect=12 * count)
     bar.set_label("absolute difference", fontsize=8)
     bar.ax.tick_params(labelsize=7)
-    figure.suptitle(title, fontsize=10).set_parse_math(False)
+    plots.head(figure, title, 10)
     return plots.save(figure, path)
 
 

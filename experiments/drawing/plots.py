@@ -148,7 +148,7 @@ def draw_panels(
     if not size:
         _below(figure, int(17 * width * columns), handles, panels, note)
     if title:
-        figure.suptitle(title, fontsize=11).set_parse_math(False)
+        head(figure, title)
     return save(figure, path)
 
 
@@ -243,7 +243,7 @@ def differences(
     """
     arms = list(next(iter(panels.values())))
     figure = new_figure(5.4, 1.1 + 0.3 * len(arms))
-    figure.suptitle(title, fontsize=11).set_parse_math(False)
+    head(figure, title)
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (name, found) in zip(grid, panels.items(), strict=True):
         plain(axes)
@@ -282,6 +282,18 @@ def new_figure(width: float, height: float):
     figure = Figure(figsize=(width, height), dpi=100, layout="constrained")
     FigureCanvasAgg(figure)
     return figure
+
+
+def head(figure: Any, title: str, size: int = 11) -> None:
+    """Writes a title above a figure, in as many lines as its width needs.
+
+    Args:
+        figure: whose width in inches is what it will be.
+        title: plain text.
+        size: of its letters, in points, whose mean width is taken as 0.58 of that.
+    """
+    columns = max(int(72 * figure.get_figwidth() / (0.58 * size)), 1)
+    figure.suptitle(textwrap.fill(title, columns), fontsize=size).set_parse_math(False)
 
 
 def heights(curves: Collection[Curve], levels: Collection[float] = ()) -> tuple[float, float]:

@@ -187,7 +187,7 @@ def drift_matrix(rows: Sequence[Mapping[str, Any]], path: str | os.PathLike, tit
     if not found:
         return None
     figure = plots.new_figure(4.6 * len(found) + 0.4, 4.3)
-    figure.suptitle(title, fontsize=10).set_parse_math(False)
+    plots.head(figure, title, 10)
     grid = figure.subplots(1, len(found), squeeze=False)[0]
     for axes, (name, (steps, matrix)) in zip(grid, found.items(), strict=True):
         low, high = np.nanmin(matrix[matrix > 0]), np.nanmax(matrix)

@@ -42,6 +42,18 @@ def test_every_game_has_a_panel_and_an_arm_one_colour(drawn, tmp_path):
     assert told[:2] == ["one", "two"] and "Pong, Human, 9: other protocol" in told
 
 
+@pytest.mark.parametrize("games", [1, 2])
+def test_a_long_title_stays_within_the_picture(games, drawn, tmp_path):
+    words = "Reconstruction and contrast of RL's own size, and how their gradients meet RL's"
+    plots.draw_panels([_panel("Pong", a=(1.0, None))] * games, tmp_path / "x.png", f"gates  {words}, {words}")
+    (figure,) = drawn
+    figure.canvas.draw()
+    (title,) = [text for text in figure.texts if "gates" in text.get_text()]
+    box = title.get_window_extent()
+    assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
+    assert all(axes.title.get_window_extent().y1 <= box.y0 for axes in figure.axes)
+
+
 def test_a_band_is_the_interval(drawn, tmp_path):
     plots.draw_panels([_panel("Pong", a=(3.0, None))], tmp_path / "x.png", "title")
     (band,) = drawn[0].axes[0].collections
