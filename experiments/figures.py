@@ -14,7 +14,6 @@ This figure is of scores at the end of runs, game by game, beside published ones
 atari100k.md and atari100k.csv, and its numbers. --games=26, 5, 3, signed or thesis names a suite.
 """
 
-import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -39,7 +38,7 @@ from .drawing.colours import styles
 from .reporting import score_table
 from .runs import collect, scores
 from .runs.collect import FINAL, RunData, comparable, steps_and_returns, steps_and_values
-from .runs.json_values import limits, plain
+from .runs.json_values import json_text, limits, plain, rounded
 from .sweeping import launching, manifest, options, probe, status
 from .sweeping.plan import OWN, Arm, Planned, parse_seeds, plan
 from .sweeping.plan import presets as matching
@@ -372,10 +371,9 @@ def write(figure: Figure, runs: Sequence[RunData], games: Sequence[str], directo
     numbers = evaluated(figure, runs, games, **how)
     if not numbers["games"]:
         why = "".join(f"; {line}" for line in left_out_lines(numbers))
-        where = f"on {', '.join(games)} in {directory.parent}"
-        raise ConfigError(f"no evaluation of any arm of figure {figure.name} {where}{why}")
+        raise ConfigError(f"no evaluation of any arm of {_where(figure, games, directory)}{why}")
     directory.mkdir(exist_ok=True)
-    replace_text(directory / f"{figure.name}.json", json.dumps(numbers, indent=1) + "\n")
+    replace_text(directory / f"{figure.name}.json", json_text(numbers) + "\n")
     return draw(figure, numbers, directory / f"{figure.name}.png")
 
 
@@ -411,15 +409,18 @@ def write_scores(
     )  # fmt: skip
     if not numbers["games"]:
         whys = (f"; {run['game']}, {run['arm']}: {run['reason']}" for run in numbers["left_out"][:3])
-        where = f"on {', '.join(games)} in {directory.parent}"
-        raise ConfigError(f"no score of any arm of figure {figure.name} {where}{''.join(whys)}")
-    numbers["presets"] = {arm.name: arm.preset for arm in figure.arms}
+        raise ConfigError(f"no score of any arm of {_where(figure, games, directory)}{''.join(whys)}")
+    numbers = rounded(numbers) | {"presets": {arm.name: arm.preset for arm in figure.arms}}
     directory.mkdir(exist_ok=True)
     name = directory / figure.name
-    replace_text(name.with_suffix(".json"), json.dumps(numbers, indent=1) + "\n")
+    replace_text(name.with_suffix(".json"), json_text(numbers) + "\n")
     replace_text(name.with_suffix(".csv"), score_table.as_csv(numbers))
     replace_text(name.with_suffix(".md"), score_table.as_markdown(numbers))
     return dots.draw(numbers, name.with_suffix(".png"))
+
+
+def _where(figure: Figure, games: Sequence[str], directory: Path) -> str:
+    return f"figure {figure.name} on {', '.join(games)} in {directory.parent}"
 
 
 def _names(text: str, known: Iterable[str]) -> list[str]:

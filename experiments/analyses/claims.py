@@ -7,7 +7,6 @@ claims.md and claims.png. Imports no jax.
 """
 
 import itertools
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from srl_jax.files import display
 
 from ..command_line import flags as config_flags
 from ..drawing import plots
+from ..runs.json_values import json_text
 from . import coverage, output, populations
 
 SEEDS = (3, 5)
@@ -312,7 +312,7 @@ def main(values: flags.FlagValues) -> None:
     found = analyse(populations.chosen())
     display.result(tables(found))
     if out is not None:
-        output.write(out, {"claims.json": json.dumps(found, indent=1), "claims.md": tables(found)})
+        output.write(out, {"claims.json": json_text(found), "claims.md": tables(found)})
         draw(found, out / "claims.png")
 
 

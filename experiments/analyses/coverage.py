@@ -5,7 +5,6 @@ and from published spreads, and prints which share of each kind of interval cont
 `--out` writes that as DIRECTORY/coverage.json. Imports no jax.
 """
 
-import json
 import zlib
 from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
@@ -18,6 +17,7 @@ from srl_jax.files import display
 from srl_jax.specs import Info
 
 from ..command_line import flags as config_flags
+from ..runs.json_values import json_text
 from . import output, populations
 
 RUNS = (2, 3, 5, 7, 10, 20)
@@ -279,7 +279,7 @@ def main(values: flags.FlagValues) -> None:
             "runs": RUNS,
             "covered": found,
         }
-        output.write(out, {"coverage.json": json.dumps(content, indent=1)})
+        output.write(out, {"coverage.json": json_text(content)})
 
 
 if __name__ == "__main__":

@@ -15,7 +15,6 @@ A campaign (--campaign) writes down before its runs what will decide, as data:
 `--out` writes DIRECTORY/tests.json and .md, and doses.png where there are doses. Imports no jax.
 """
 
-import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -35,7 +34,7 @@ from ..command_line import flags as config_flags
 from ..command_line import paths
 from ..drawing import plots
 from ..runs import collect
-from ..runs.json_values import limits, plain
+from ..runs.json_values import json_text, limits, plain
 from ..runs.run_data import RunData
 from . import output
 from .populations import LEVEL
@@ -249,7 +248,7 @@ def main(values: flags.FlagValues) -> None:
     found = analyse(campaign, asked)
     display.result(tables(found))
     if out is not None:
-        output.write(out, {"tests.json": json.dumps(found, indent=1), "tests.md": tables(found)})
+        output.write(out, {"tests.json": json_text(found), "tests.md": tables(found)})
         if "doses" in asked:
             draw(asked, found, out / "doses.png")
 

@@ -6,7 +6,6 @@ test, and Holm's correction over the objectives of a figure and game. A figure o
 left out. `--out` writes DIRECTORY/objectives.json and .md, and a picture of each figure. Imports no jax.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from .. import arms, packing
 from ..command_line import flags as config_flags
 from ..drawing import plots
 from ..runs import collect
-from ..runs.json_values import limits
+from ..runs.json_values import json_text, limits
 from ..runs.run_data import RunData
 from . import output
 from .populations import LEVEL, RESULTS
@@ -185,7 +184,7 @@ def main(values: flags.FlagValues) -> None:
     found = analyse()
     display.result(tables(found))
     if out is not None:
-        texts = {"objectives.json": json.dumps(found, indent=1), "objectives.md": tables(found)}
+        texts = {"objectives.json": json_text(found), "objectives.md": tables(found)}
         output.write(out, texts)
         for name, games in found.items():
             draw(name, games, out / f"{name}.png")

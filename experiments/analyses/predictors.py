@@ -5,7 +5,6 @@ learning curve from then on, over the runs of results/catch_runs.json: within ar
 writes DIRECTORY/predictors.json, predictors.md and predictors.png. Imports no jax.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,6 +17,7 @@ from srl_jax.statistics import ENOUGH, holm
 
 from ..command_line import flags as config_flags
 from ..drawing import plots
+from ..runs.json_values import json_text
 from ..runs.run_data import RunData
 from . import output, populations
 from .populations import LEVEL, ChosenArm
@@ -325,7 +325,7 @@ def main(values: flags.FlagValues) -> None:
     rows = analyse(populations.chosen())
     display.result(tables(rows))
     if out is not None:
-        lines = ",\n".join(f" {json.dumps(row)}" for row in rows)
+        lines = ",\n".join(f" {json_text(row, None)}" for row in rows)
         output.write(out, {"predictors.json": f"[\n{lines}\n]", "predictors.md": tables(rows)})
         draw(rows, out / "predictors.png")
 
