@@ -183,9 +183,13 @@ def commands(results: Path = RESULTS) -> Iterator[tuple[str, list[str]]]:
         scores = numbers["figure"] == SCORES
         arms = numbers["arms"].values() if scores else numbers["games"].values()
         of_game = [values for arm in arms for values in arm["games" if scores else "arms"].values()]
-        seeds = sorted({seed for values in of_game for seed in values["seeds"]})
+        left = numbers.get("left_out", ())
+        games = dict.fromkeys([*numbers["games"], *(run["game"] for run in left)])
+        seeds = sorted(
+            {run["seed"] for run in left} | {seed for values in of_game for seed in values["seeds"]}
+        )
         figure = str(given) if given.exists() else numbers["figure"]
-        arguments = [f"--figure={figure}", f"--games={','.join(numbers['games'])}"]
+        arguments = [f"--figure={figure}", f"--games={','.join(games)}"]
         if scores:
             arguments.append(f"--presets={','.join(numbers['presets'].values())}")
         if numbers["forced"]:

@@ -118,8 +118,8 @@ def read(campaign: Path) -> dict[str, Any]:
     try:
         unknown = set(asked["measures"]) - MEASURES.keys()
         tests = [weights for family in asked["families"].values() for weights in family.values()]
-        for weights in tests:
-            np.array([*weights.values()], np.float64)
+        if not all(weights and all(type(x) in (int, float) for x in weights.values()) for weights in tests):
+            raise ValueError
         seeds = asked["seeds"]
         if unknown or not tests or not isinstance(asked["game"], str) or not isinstance(seeds, list):
             raise ValueError
@@ -128,7 +128,10 @@ def read(campaign: Path) -> dict[str, Any]:
         if doses := asked.get("doses"):
             lines = [its for of_panel in doses["panels"].values() for its in of_panel.values()]
             named = doses.keys() >= {"across", "reference"} and "area" in asked["measures"]
+            arms = [doses.get("reference"), *(arm for its in lines for arm in its.values())]
             if not named or not all(float(dose) > 0 for its in lines for dose in its):
+                raise ValueError
+            if not all(isinstance(arm, str) for arm in arms):
                 raise ValueError
     except (TypeError, KeyError, ValueError, AttributeError):
         wanted = (
@@ -195,12 +198,13 @@ def tables(found: Mapping[str, Any]) -> str:
         arms = [[arm, output.interval(row, ".3f")] for arm, row in found["arms"][measure].items()]
         parts.append(f"**Arms** ({measure})\n\n{output.markdown(['arm', 'mean'], arms)}")
     for panel, lines in found.get("best", {}).items():
-        head = ["best of", *next(iter(lines.values()))]
+        doses = dict.fromkeys(dose for its in lines.values() for dose in its)
         body = [
-            [line, *(f"{share:.0%}".replace("%", " %") for share in its.values())]
+            [line, *(f"{100 * its[dose]:.0f} %" if dose in its else "-" for dose in doses)]
             for line, its in lines.items()
         ]
-        parts.append(f"**How often which dose is best, {panel}**\n\n{output.markdown(head, body)}")
+        table = output.markdown(["best of", *doses], body)
+        parts.append(f"**How often which dose is best, {panel}**\n\n{table}")
     return "\n\n".join(parts)
 
 
@@ -226,7 +230,9 @@ def draw(asked: Mapping[str, Any], found: Mapping[str, Any], path: Path) -> Path
         drawn = []
         for name, its in lines.items():
             at = [float(np.log10(float(dose))) for dose in its]
-            band = ([areas[arm][key] for arm in its.values()] for key in ("mean", "low", "high"))
+            band = (
+                np.array([areas[arm][key] for arm in its.values()], float) for key in ("mean", "low", "high")
+            )
             drawn.append(plots.Line(name, plots.Curve(at, *band), len(asked["seeds"])))
         level = plots.Level(reference, areas[reference]["mean"])
         ticks = {float(np.log10(float(dose))): dose for its in lines.values() for dose in its}

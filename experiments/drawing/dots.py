@@ -10,11 +10,14 @@ from typing import Any
 import numpy as np
 
 from ..runs.scores import FAR
+from .colours import LINES
 from .plots import head, new_figure, plain, save
 
 GREY = "#8c8c8c"
-MARKERS = ("D", "s", "^", "v", "P")
-"""Of published methods, in their order."""
+MARKERS = tuple(itertools.product(("white", GREY, "black"), ("D", "s", "^", "v", "P", "<", ">")))
+"""Of published methods, in their order: what they are filled with, and what form they have."""
+FORMS = dict(zip(LINES, ("o", "h", "*", "X"), strict=True))
+"""Of arms, whose styles are a colour and a line."""
 LINEAR = 0.2
 """Human-normalised scores up to which the axis is linear, in both directions; beyond, it is logarithmic."""
 
@@ -22,9 +25,10 @@ LINEAR = 0.2
 def draw(numbers: Mapping[str, Any], path: str | os.PathLike) -> Path:
     """Draws what `runs.scores.evaluated` gave: games below each other, human-normalised scores across.
 
-    A bar is a published mean and one standard deviation over runs to either side, a hollow mark a published
-    mean; a dot is an arm's mean, a tick each of its seeds. A ring marks a mean that is above or below all
-    published ones. Games are sorted by the first method that has them all, or else by the first arm.
+    A bar is a published mean and one standard deviation over runs to either side, a mark with a grey edge a
+    published mean; one in colour is an arm's mean, a tick each of its seeds. A ring marks a mean that is
+    above or below all published ones. Games are sorted by the first method that has them all, or else by the
+    first arm.
 
     Args:
         numbers: at least one game.
@@ -40,7 +44,7 @@ def draw(numbers: Mapping[str, Any], path: str | os.PathLike) -> Path:
     shown: list[float] = [0.0, 1.0]
     places = np.linspace(-0.22, 0.22, len(published)) if len(published) > 1 else np.zeros(1)
     markers = itertools.cycle(MARKERS)
-    for (name, entry), marker, place in zip(published.items(), markers, places, strict=False):
+    for (name, entry), (filled, marker), place in zip(published.items(), markers, places, strict=False):
         known = {game: x for game, x in entry["games"].items() if game in at}
         rows = [at[game] + place for game in known]
         means = [x["normalised"] for x in known.values()]
@@ -49,21 +53,21 @@ def draw(numbers: Mapping[str, Any], path: str | os.PathLike) -> Path:
             low, high = np.subtract(means, spread), np.add(means, spread)
             axes.hlines(rows, low, high, color="#cfcfcf", linewidth=5, zorder=1)
             shown += [*low[np.isfinite(low)], *high[np.isfinite(high)]]
-        look = {"markerfacecolor": "white", "color": GREY, "markersize": 5, "zorder": 2}
+        look = {"markerfacecolor": filled, "color": GREY, "markersize": 5, "zorder": 2}
         (drawn,) = axes.plot(means, rows, linestyle="none", marker=marker, **look)
         text = ", mean ± standard deviation over runs" if np.isfinite(spread).any() else ""
         handles[f"{name}{text}"] = drawn
         shown += means
     beside = np.linspace(-0.16, 0.16, len(arms)) if len(arms) > 1 else np.zeros(1)
     for (arm, entry), place in zip(arms.items(), beside, strict=True):
-        colour = numbers["styles"].get(arm, ("#0072b2",))[0]
+        colour, line = numbers["styles"].get(arm, ("#0072b2", "-"))
         for game, x in entry["games"].items():
             row, value = at[game] + place, x["normalised"]["mean"]
             seeds = x["normalised_scores"]
             axes.plot(
                 seeds, [row] * len(seeds), "|", color=colour, markersize=8, markeredgewidth=1.1, zorder=3
             )
-            (drawn,) = axes.plot([value], [row], "o", color=colour, markersize=6, zorder=4)
+            (drawn,) = axes.plot([value], [row], FORMS[line], color=colour, markersize=6, zorder=4)
             if x["verdict"] in ("above", "below"):
                 axes.plot([value], [row], "o", color="black", fillstyle="none", markersize=10, zorder=5)
             shown += seeds

@@ -161,11 +161,13 @@ def _draw_panel(axes, panel: Panel, looks: Mapping[str, Style]) -> dict[str, Any
     handles = {}
     for label, curve, seeds, thesis, runs in lines:
         colour, pattern = looks[label]
+        marker = "o" if len(curve.at) == 1 else ""  # of a single evaluation there is no line, nor a band
         if runs:
-            axes.plot(curve.at, np.transpose(runs), color=colour, linewidth=0.8, alpha=0.5)
+            axes.plot(curve.at, np.transpose(runs), color=colour, linewidth=0.8, alpha=0.5, marker=marker)
+        elif marker:
+            axes.vlines(curve.at, curve.low, curve.high, color=colour, alpha=0.5)
         else:
             axes.fill_between(curve.at, curve.low, curve.high, color=colour, alpha=0.18, linewidth=0)
-        marker = "o" if len(curve.at) == 1 else ""
         (drawn,) = axes.plot(curve.at, curve.point, pattern, color=colour, linewidth=1.8, marker=marker)
         handles[f"{label} ({seeds} seed{'' if seeds == 1 else 's'})" if seeds else label] = drawn
         if thesis is not None:
@@ -204,11 +206,12 @@ def _below(figure, width: int, handles: dict[str, Any], panels: Sequence[Panel],
     if any(line.thesis is not None for panel in panels for line in panel.lines):  # in no arm's colour
         grey = Line2D([], [], color="#555555", linestyle="--", linewidth=1.2)
         handles = {**handles, "the thesis' own, one run each": grey}
+    columns = 1 if len(panels) == 1 else 2
     legend = figure.legend(
         handles.values(),
-        handles.keys(),
+        [wrapped(label, figure.get_figwidth() / columns - 0.6, 8) for label in handles],
         loc="outside lower center",
-        ncols=1 if len(panels) == 1 else 2,
+        ncols=columns,
         fontsize=8,
         title="\n".join(notes),
         title_fontsize=7,
@@ -241,8 +244,9 @@ def differences(
         looks: what differs -> those of the arms.
         path: of the PNG file.
     """
-    arms = list(next(iter(panels.values())))
-    figure = new_figure(5.4, 1.1 + 0.3 * len(arms))
+    arms = [wrapped(arm, 2, 8) for arm in next(iter(panels.values()))]
+    more = sum(arm.count("\n") for arm in arms)
+    figure = new_figure(5.4, 1.1 + 0.3 * len(arms) + 0.15 * more)
     head(figure, title)
     grid = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for axes, (name, found) in zip(grid, panels.items(), strict=True):
@@ -259,7 +263,8 @@ def differences(
         axes.tick_params(axis="y", length=0)
         axes.tick_params(axis="x", labelsize=8)
         axes.margins(x=0.08)
-    figure.supxlabel(f"difference from {baseline}", fontsize=8).set_parse_math(False)
+    below = wrapped(f"difference from {baseline}", figure.get_figwidth(), 8)
+    figure.supxlabel(below, fontsize=8).set_parse_math(False)
     return save(figure, path)
 
 
@@ -284,16 +289,20 @@ def new_figure(width: float, height: float):
     return figure
 
 
-def head(figure: Any, title: str, size: int = 11) -> None:
-    """Writes a title above a figure, in as many lines as its width needs.
+def wrapped(text: str, width: float, size: int) -> str:
+    """A text in as many lines as it needs.
 
     Args:
-        figure: whose width in inches is what it will be.
-        title: plain text.
-        size: of its letters, in points, whose mean width is taken as 0.58 of that.
+        text: plain.
+        width: that there is, in inches.
+        size: of the letters, in points, whose mean width is taken as 0.58 of that.
     """
-    columns = max(int(72 * figure.get_figwidth() / (0.58 * size)), 1)
-    figure.suptitle(textwrap.fill(title, columns), fontsize=size).set_parse_math(False)
+    return textwrap.fill(text, max(int(72 * width / (0.58 * size)), 1))
+
+
+def head(figure: Any, title: str, size: int = 11) -> None:
+    """Writes a title above a figure, whose width in inches is what it will be, see `wrapped`."""
+    figure.suptitle(wrapped(title, figure.get_figwidth(), size), fontsize=size).set_parse_math(False)
 
 
 def heights(curves: Collection[Curve], levels: Collection[float] = ()) -> tuple[float, float]:

@@ -43,7 +43,7 @@ def _rows(numbers: Mapping[str, Any]) -> Iterator[dict[str, Any]]:
         for game, x in entry["games"].items():
             yield {
                 "game": game, "statistic": "score", "of": arm, **_interval(x), "runs": len(x["seeds"]),
-                "scores": " ".join(f"{score:g}" for score in x["scores"]),
+                "scores": " ".join(f"{score:.8g}" for score in x["scores"]),
                 "normalised": x["normalised"]["mean"], "verdict": x["verdict"] or None,
                 "basis": "; ".join(dict.fromkeys(x["of"])), "level": "runs",
             }  # fmt: skip

@@ -199,7 +199,7 @@ def shared(arms: Mapping[Any, Curves]) -> dict[Any, Curves]:
     start, until = max(int(steps[0]) for steps in every), min(int(steps[-1]) for steps in every)
     if start > until:
         raise ConfigError(
-            f"--runs: no env step that all curves have: one begins at {start:,}, another ends at {until:,}"
+            f"no env step that all curves have: one begins at {start:,}, another ends at {until:,}"
         )
 
     def cut(steps: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -345,13 +345,17 @@ def _other_files(runs: Iterable[RunData]) -> Iterator[str]:
 
 
 def check_protocols(
-    runs: Sequence[RunData], *, force: bool = False, more: Sequence[str] = (), across_games: bool = False
+    runs: Sequence[RunData],
+    *,
+    force: bool | None = None,
+    more: Sequence[str] = (),
+    across_games: bool = False,
 ) -> list[str]:
     """Whether returns of these runs mean the same: one protocol for each game.
 
     Args:
         runs: those without a policy's returns do not count.
-        force: say what differs, and do not refuse.
+        force: say what differs, and do not refuse; None where the program has no such flag.
         more: fields beside `PROTOCOL` that must be the same.
         across_games: whether it is one for each arm, in all of its games.
 
@@ -370,7 +374,8 @@ def check_protocols(
         if differing := difference(reference.config, run.config, (*PROTOCOL, *more)):
             found.append(f"{run.path}: another protocol than {reference.path}: {differing}")
     if found and not force:
-        raise ConfigError(f"{found[0]}; --force compares them all the same")
+        way_out = "" if force is None else "; --force compares them all the same"
+        raise ConfigError(f"{found[0]}{way_out}")
     return found
 
 

@@ -7,8 +7,9 @@ import numpy as np
 
 from srl_jax.statistics import Interval
 
-DIGITS = 8
-"""Of a number in a file. Processors differ in the sixteenth, and a file is the same whichever wrote it."""
+DIGITS, PLACES = 8, 12
+"""Of a number in a file, significant and behind the point at most. Processors differ in the sixteenth digit,
+and of a difference in earlier ones: a file is the same whichever wrote it."""
 
 
 def limits(interval: Interval) -> dict[str, Any]:
@@ -26,9 +27,9 @@ def plain(values: Any) -> Any:
 
 
 def rounded(values: Any) -> Any:
-    """Lists and dicts of numbers that were computed, floats with `DIGITS` significant digits."""
+    """Lists and dicts of numbers that were computed, floats with `DIGITS` and no more than `PLACES`."""
     if isinstance(values, float):
-        return float(f"{values:.{DIGITS}g}")
+        return float(f"{round(values, PLACES):.{DIGITS}g}") + 0.0  # which has no -0.0
     if isinstance(values, dict):
         return {key: rounded(value) for key, value in values.items()}
     return [rounded(value) for value in values] if isinstance(values, list | tuple) else values

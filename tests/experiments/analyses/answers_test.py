@@ -78,6 +78,17 @@ def test_what_survives_holms_correction():
     assert answers.surviving({"c": arms["c"], "one": untested}) == set()
 
 
+def test_a_seed_that_was_left_out_is_asked_for_again(tmp_path, monkeypatch):
+    monkeypatch.setattr(answers.packing, "is_packed", lambda folder: True)
+    arms = {"a": {"seeds": [0, 1]}}
+    left = [{"arm": "a", "game": game, "seed": 4} for game in ("Catch", "Pong")]
+    numbers = {"figure": "6.3", "games": {"Catch": {"arms": arms}}, "forced": [], "left_out": left}
+    (tmp_path / "x/figures").mkdir(parents=True)
+    (tmp_path / "x/figures/6.3.json").write_text(json.dumps(numbers))
+    drawn = dict(answers.commands(tmp_path))["x/6.3"]
+    assert "--seeds=0,1,4," in drawn and "--games=Catch,Pong" in drawn
+
+
 def test_every_figure_of_a_packed_campaign_is_drawn_again():
     found = dict(answers.commands())
     drawn = {name for name in found if "/" in name}

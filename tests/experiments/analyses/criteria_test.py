@@ -102,6 +102,10 @@ def test_drift_is_to_the_encoder_before_from_the_second_on(measure):
         ({"families": {}}, "expected"),
         ({"families": {"a": {"b": ["low"]}}}, "expected"),
         ({"families": {"a": {"b": {"low": "1-"}}}}, "expected"),
+        ({"families": {"a": {"b": {"low": "1", "high": None}}}}, "expected"),
+        ({"families": {"a": {"b": {}}}}, "expected"),
+        ({"doses": {**ASKED["doses"], "reference": ["base"]}}, "expected"),
+        ({"doses": {**ASKED["doses"], "panels": {"one": {"line": {"1": ["low"]}}}}}, "expected"),
         (
             {"families": {"a": {"b": {"nobody": 1}}}},
             "nobody on Catch has no run that is over of seed 0, 1, 2",
@@ -122,4 +126,14 @@ def test_criteria_that_are_none_are_one_line(campaign, changed, said):
 
 def test_the_picture_has_a_panel_of_each(campaign, tmp_path):
     pytest.importorskip("matplotlib")
-    assert criteria.draw(ASKED, analysed(campaign), tmp_path / "doses.png").stat().st_size > 1000
+    found = analysed(campaign)
+    # Runs that are all alike have no interval.
+    found["arms"]["area"]["low"] |= {"low": None, "high": None}
+    assert criteria.draw(ASKED, found, tmp_path / "doses.png").stat().st_size > 1000
+
+
+def test_lines_of_other_doses_have_their_shares_below_them():
+    best = {"one": {"first": {"0.1": 0.2, "1": 0.8}, "second": {"1": 0.9, "10": 0.1}}}
+    text = criteria.tables({"tests": {}, "best": best})
+    assert "| best of | 0.1 | 1 | 10 |" in text
+    assert "| first | 20 % | 80 % | - |" in text and "| second | - | 90 % | 10 % |" in text

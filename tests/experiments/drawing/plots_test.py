@@ -7,6 +7,7 @@ pytest.importorskip("matplotlib")
 
 from experiments.drawing import plots  # noqa: E402
 from srl_jax.data import thesis_curve  # noqa: E402
+from srl_jax.statistics import Interval  # noqa: E402
 
 STEPS = [0, 100, 200]
 
@@ -50,8 +51,46 @@ def test_a_long_title_stays_within_the_picture(games, drawn, tmp_path):
     figure.canvas.draw()
     (title,) = [text for text in figure.texts if "gates" in text.get_text()]
     box = title.get_window_extent()
-    assert box.x0 >= 0 and box.x1 <= figure.bbox.width and box.y1 <= figure.bbox.height
+    assert _inside(box, figure) and box.y1 <= figure.bbox.height
     assert all(axes.title.get_window_extent().y1 <= box.y0 for axes in figure.axes)
+
+
+def _inside(box, figure):
+    return box.x0 >= 0 and box.x1 <= figure.bbox.width
+
+
+@pytest.mark.parametrize("games", [1, 2])
+def test_long_names_of_arms_stay_within_the_picture(games, drawn, tmp_path):
+    name = "w" + "".join(f"ord_{i}" for i in range(20))
+    assert len(name) > 90
+    plots.draw_panels(
+        [_panel("Pong", **{name: (1.0, None), "b": (2.0, None)})] * games, tmp_path / "x.png", ""
+    )
+    intervals = {arm: Interval(1.0, 0.0, 2.0, "Welch") for arm in (name, "b")}
+    plots.differences(
+        "title", name, {"area": intervals}, {"area": [("#112233", "-")] * 2}, tmp_path / "x.png"
+    )
+    for figure in drawn:
+        figure.canvas.draw()
+    (legend,) = drawn[0].legends
+    assert _inside(legend.get_window_extent(), drawn[0])
+    (axes,) = drawn[1].axes
+    assert axes.bbox.width > drawn[1].bbox.width / 2
+    assert all(_inside(x.get_window_extent(), drawn[1]) for x in (*axes.get_yticklabels(), *drawn[1].texts))
+
+
+@pytest.mark.parametrize("seeds", [2, 5])
+def test_of_a_single_evaluation_there_are_the_runs_or_the_interval(seeds, drawn, tmp_path):
+    runs = [[1.0], [3.0]] if seeds == 2 else ()
+    line = plots.Line("a", plots.Curve([0], *(np.array([x]) for x in (2.0, 1.0, 3.0))), seeds, runs=runs)
+    plots.draw_panels([plots.Panel("Pong", [line])], tmp_path / "x.png", "title")
+    axes = drawn[0].axes[0]
+    assert [(*x.get_ydata(), x.get_marker()) for x in axes.lines] == [
+        *((run, "o") for (run,) in runs),
+        (2.0, "o"),
+    ]
+    segments = [x.get_segments()[0][:, 1].tolist() for x in axes.collections]
+    assert segments == ([] if runs else [[1.0, 3.0]])
 
 
 def test_a_band_is_the_interval(drawn, tmp_path):

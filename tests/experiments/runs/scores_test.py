@@ -10,6 +10,8 @@ import pytest
 
 from experiments import figures, packing
 from experiments.arms import figures_named
+from experiments.drawing import dots
+from experiments.drawing.colours import styles
 from experiments.presets import PRESETS
 from experiments.reporting import score_table
 from experiments.runs import collect, scores
@@ -239,6 +241,26 @@ def test_the_figure_is_the_same_from_packed_runs_byte_for_byte(runs, tmp_path, c
     for name in names[:2]:
         values = [float(x) for x in re.findall(r"\d+\.\d+", (packed / "figures" / name).read_text())]
         assert values and all(x == float(f"{x:.8g}") for x in values)
+
+
+def test_no_two_arms_and_no_two_methods_look_alike(monkeypatch):
+    pytest.importorskip("matplotlib")
+    arms = [name.partition("/")[2] for name in PRESETS if name.startswith("atari100k/")]
+    methods = {name for names in scores.BESIDE.values() for name in names}
+    entry = {"normalised": {"mean": 0.5}, "normalised_scores": [0.5], "verdict": "", "seeds": [0]}
+    published = {"normalised": 0.5, "normalised_sd": None}
+    numbers = {
+        "title": "",
+        "arms": {arm: {"games": {"Pong": entry}} for arm in arms},
+        "published": {name: {"games": {"Pong": published}} for name in methods},
+        "styles": styles(arms),
+        "games": ["Pong"],
+    }
+    monkeypatch.setattr(dots, "_notes", lambda numbers: [])
+    monkeypatch.setattr(dots, "save", lambda figure, path: figure)
+    (legend,) = dots.draw(numbers, "x.png").legends
+    looks = [(x.get_marker(), x.get_color(), x.get_markerfacecolor()) for x in legend.legend_handles]
+    assert len(set(looks)) == len(looks) == len(arms) + len(methods) > 25
 
 
 @pytest.mark.parametrize(
