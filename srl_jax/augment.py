@@ -1,16 +1,18 @@
 """Data augmentation: random views of a sequence of frames, and of a window; who sees which."""
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
+from srl_jax import plugins
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError
 from srl_jax.learning import modes
 from srl_jax.plugins import Registry
-from srl_jax.specs import choices_text
+from srl_jax.specs import choices_text, split
 from srl_jax.types import Array, Window
 from srl_jax.window import observation, to_unit
 
@@ -88,7 +90,11 @@ VIEWS = Registry(
     {"shift": random_shift, "intensity": intensity, "crop_pad_crop": crop_pad_crop},
     reserved=("none", "same"),
 )
-"""{name: (frames [T, H, W, C], key) -> frames}: the parts of a view, as in `shift+intensity`."""
+"""{name: (frames [T, H, W, C], key) -> frames}: the parts of a view, as in `shift+intensity`.
+
+Frames are uint8, or float32 in [0, 1] behind a part that makes them so, and stay one of the two; their shape
+stays what it was. `check_views` asks for that.
+"""
 register = VIEWS.register
 
 EACH = "@each"
@@ -212,3 +218,42 @@ class Views(NamedTuple):
 
 UNCHANGED = Views()
 """Every loss sees the window as replay has it."""
+
+
+def check_views(config: Config, size: int) -> None:
+    """Whether all views of a run can be drawn of its frames, and give what `VIEWS` says.
+
+    Args:
+        config: with every option of its specs.
+        size: height and width of a frame; its channels are 1 or 3, whichever a view takes.
+
+    Raises:
+        ConfigError: there is no such view, or it does not; one line that names the flag.
+    """
+    texts = {f"{flag}_view": text for flag, text in Views.of(config)._asdict().items()}
+    for flag, specs_of in {"rl": [config.rl], "objective": config.objectives}.items():
+        for text in specs_of:
+            name, options = split(text)
+            texts[f"{flag}={name}:view"] = str(options.get("view", "none"))
+    for flag, text in texts.items():
+        for part in () if text in ("none", "same") else text.removesuffix(EACH).split("+"):
+            problems = [_problem(VIEWS[part], size, channels) for channels in (1, 3)]
+            if all(problems):
+                raise ConfigError(f"--{flag}={text}: {problems[0]}")
+
+
+def _problem(view: Callable[[Array, Array], Array], size: int, channels: int) -> str:
+    """What is wrong with a part of a view, or ""."""
+    key = jax.random.key(0)
+    white = jnp.full((2, size, size, channels), 255, jnp.uint8)
+    try:
+        # To run it takes longer than to look at its shapes, and those of the package give what they should.
+        seen = view(white, key) if plugins.foreign(view) else jax.eval_shape(view, white, key)
+        shape, dtype = seen.shape, seen.dtype
+    except Exception as error:
+        return plugins.reason(error, Path(plugins.origin(view))) if plugins.foreign(view) else str(error)
+    if shape != white.shape or dtype not in (jnp.uint8, jnp.float32):
+        wanted = f"uint8 or float32 of shape {list(white.shape)}"
+        return f"gives {dtype} of shape {list(shape)}; it must give {wanted}"
+    most = float(jnp.max(jnp.abs(seen))) if isinstance(seen, jax.Array) and dtype == jnp.float32 else 0.0
+    return "" if most <= 2.0 else f"makes {most:g} of a white pixel; float32 must be in [0, 1], or nearly so"

@@ -124,7 +124,9 @@ class Loaded:
         return result.reshape(*ahead, *result.shape[1:])
 
 
-def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) -> Loaded:
+def load(
+    path: str | os.PathLike[str], *, imports: str | os.PathLike[str] | Iterable[str] | None = None
+) -> Loaded:
     """Loads what was trained.
 
         policy = srl_jax.load("runs/pong")  # or "runs/pong/best", "runs/pong/checkpoints/000500000"
@@ -134,8 +136,8 @@ def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) 
     Args:
         path: a run directory, whose newest checkpoint is meant; one of its checkpoints; its best/; or an
             encoder that was kept in its encoders/, which has no policy beside it.
-        imports: files and modules to import first, which register what the run is made of, as of `--import`;
-            None for those that its configuration names.
+        imports: a file or module, or several, to import first, which register what the run is made of, as of
+            `--import`; None for those that its configuration names.
 
     Raises:
         srl_jax.errors.ConfigError: there is none, it is damaged, does not fit this code, or something cannot
@@ -143,6 +145,8 @@ def load(path: str | os.PathLike[str], *, imports: Iterable[str] | None = None) 
     """
     if Path(path).suffix == ".npz":
         raise ConfigError(f"{path}: an exported encoder is read by srl_jax.encoders.from_npz")
+    if isinstance(imports, str | os.PathLike):
+        imports = [os.fspath(imports)]
     manifest = checkpoint.read_manifest(Path(path))
     plugins.load(manifest.config.imports if imports is None else map(plugins.located, imports))
     try:

@@ -88,7 +88,7 @@ def resolved(config: Config, given: Collection[str] = ()) -> Config:
             these frames, or replay has no room for a window, or there is no such view, or a logger's package
             is missing, or nothing reads what was given.
     """
-    from srl_jax.augment import Views
+    from srl_jax.augment import check_views
     from srl_jax.files import loggers
     from srl_jax.learning.agent import components, trained_terms
 
@@ -102,7 +102,7 @@ def resolved(config: Config, given: Collection[str] = ()) -> Config:
     size = config.frame_size or 84
     _, algorithm, terms = components(config, (size, size, 1), num_actions=18)
     checks.check_replay(config, trained_terms(config, algorithm, terms)[1])
-    Views.of(config)
+    check_views(full, size)
     refuse_unread(config, full, terms, given)
     return full
 

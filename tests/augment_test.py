@@ -5,7 +5,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from srl_jax.augment import intensity, make_view, random_shift
+from srl_jax import training
+from srl_jax.augment import VIEWS, intensity, make_view, random_shift
+from srl_jax.config import Config
+from srl_jax.errors import ConfigError
 
 
 def shifts(frames, pad):
@@ -52,6 +55,40 @@ def test_a_draw_for_each_observation_is_of_the_views_of_a_run_alone(text):
     plain = text.replace("@each", "").replace("+", r"\+")
     with pytest.raises(ValueError, match=rf"^@each ends a view, and --rl_view, .* take it; give {plain}$"):
         make_view(text)
+
+
+@pytest.mark.parametrize(
+    ("view", "text", "says"),
+    [
+        (
+            lambda frames, key: frames.astype(jnp.int16) + 20,
+            "own",
+            "own: gives int16 of shape [2, 84, 84, 1]",
+        ),
+        (lambda frames, key: frames[:, ::2], "shift+own@each", "gives uint8 of shape [2, 42, 84, 1]"),
+        (lambda frames, key: 0.9 * frames, "own", "own: makes 229.5 of a white pixel"),
+        (lambda frames, key: frames.nothing, "own", "AttributeError: "),
+        (lambda frames, key: frames / jnp.float32(255), "own+shift", ""),
+        (lambda frames, key: frames[..., jnp.array([2, 1, 0])].reshape(2, -1, 84, 3), "own", ""),
+    ],
+)
+def test_a_view_of_ones_own_gives_what_views_give(view, text, says, monkeypatch):
+    monkeypatch.setitem(VIEWS, "own", view)
+    for options in ({"rl_view": text}, {"mode": "joint", "objectives": ("vae",), "srl_view": text}):
+        if not says:
+            training.resolved(Config(game="Catch", **options))
+            continue
+        with pytest.raises(ConfigError) as raised:
+            training.resolved(Config(game="Catch", **options))
+        assert str(raised.value).startswith("--") and says in str(raised.value)
+
+
+def test_a_view_that_does_not_fit_the_frames_is_refused_before_a_run():
+    own = {"game": "gymnasium:id=Any-v0", "encoder": "impala", "mode": "joint", "objectives": ("infonce",)}
+    training.resolved(Config(**own, frame_size=6))
+    says = "--objective=infonce:view=crop_pad_crop: crop_pad_crop cuts 4 pixels off each side"
+    with pytest.raises(ConfigError, match=f"^{says}, and the frames have 5$"):
+        training.resolved(Config(**own, frame_size=5))
 
 
 def test_four_pixels_is_the_default_and_none_the_identity():

@@ -182,6 +182,8 @@ def test_what_a_run_imports_is_imported_first(tmp_path, monkeypatch):
         moved = file.rename(tmp_path / "moved.py")
         with pytest.raises(ConfigError, match=f"^--import={file}: no such file"):
             srl_jax.load(run)
-        assert srl_jax.load(run, imports=[str(moved)]).encode(observations(1)).shape == (1, 5)
+        for imports in ([str(moved)], str(moved), moved):
+            assert srl_jax.load(run, imports=imports).encode(observations(1)).shape == (1, 5)
+            forget()
     finally:
         forget()

@@ -84,12 +84,17 @@ class Adapter(FrameVectorEnv):
             if isinstance(error, ModuleNotFoundError):
                 what += " A file is found in the working directory, or by --import=PATH/FILE.py"
             raise ConfigError(f"cannot be made: {what}") from error
+        for env in self._envs:
+            if not isinstance(env, gymnasium.Env):
+                raise ConfigError(f"is no gymnasium.Env: its function makes a {type(env).__name__}")
+        if len({id(env) for env in self._envs}) < num_envs:
+            raise ConfigError("its function gives one environment twice; it must make another at each call")
         self._grey, self._render, self._skip, self._max_steps = grey, render, frame_skip, max_steps
         first = self._envs[0]
         actions = _actions(first)
         self._colours = 3 if render else _colours(first)
         start = int(actions.start)
-        names: list[str] = _attribute(first, "get_action_meanings", list)()
+        names = _names(first, "get_action_meanings")
         height, width = (frame_size, frame_size) if frame_size else self._own_size()
         super().__init__(
             num_envs=num_envs,
@@ -98,7 +103,7 @@ class Adapter(FrameVectorEnv):
             action_meanings=names if len(names) == actions.n else map(str, range(start, start + actions.n)),
         )
         self._first_action = start
-        self.state_names = tuple(_attribute(first, "state_names", ()))
+        self.state_names = _names(first, "state_names")
         self._resize = bool(frame_size)
         self._frames = np.zeros((num_envs, *self.single_observation_space.shape), np.uint8)
         self._states = np.zeros((num_envs, len(self.state_names)), np.float32)
@@ -112,6 +117,8 @@ class Adapter(FrameVectorEnv):
         if self._render:
             env.reset(seed=0)
             image = np.asarray(env.render())
+            if image.ndim not in (2, 3):
+                raise ConfigError(f"must render images; it gave {image.dtype} {list(image.shape)}")
         elif isinstance(image, Dict):
             image = image["image"]
         height, width = image.shape[:2]
@@ -181,7 +188,7 @@ class Adapter(FrameVectorEnv):
             )
         self._frames[i] = image
         if self.state_names:
-            state = np.asarray(info.get("state", ()), np.float32)
+            state = np.asarray((info or {}).get("state", ()), np.float32)
             if state.shape != self._states[i].shape:
                 raise ConfigError(
                     f"the environment's info['state'] must hold the {len(self.state_names)} numbers of its "
@@ -225,13 +232,35 @@ class Adapter(FrameVectorEnv):
                 display.say(f"an environment was not closed: {_line(error)}")
 
 
+def check(make: Callable[..., FrameVectorEnv]) -> None:
+    """Makes two environments and takes a step in each.
+
+    Raises:
+        ConfigError: they cannot be made, reset or stepped; a reason that follows the game's name.
+    """
+    envs = make(num_envs=2, seed=0, frame_size=1)
+    try:
+        envs.reset(seed=0)
+        envs.step(np.zeros(2, np.int64))
+    except ConfigError:
+        raise
+    except Exception as error:
+        raise ConfigError(f"cannot be reset and stepped: {_line(error)}") from error
+    finally:
+        envs.close()
+
+
 def _line(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())
 
 
-def _attribute(env: gymnasium.Env, name: str, default: Any) -> Any:
-    """Of its outermost wrapper that has it, or of the environment inside."""
-    return env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else default
+def _names(env: gymnasium.Env, name: str) -> tuple[str, ...]:
+    """A list of names, or what a function gives, of the outermost wrapper that has it; () of none."""
+    found = env.get_wrapper_attr(name) if env.has_wrapper_attr(name) else ()
+    found = found() if callable(found) else found
+    if not isinstance(found, list | tuple) or not all(isinstance(each, str) for each in found):
+        raise ConfigError(f"its {name} must be a list of names")
+    return tuple(found)
 
 
 def _actions(env: gymnasium.Env) -> Discrete:

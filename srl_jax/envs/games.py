@@ -209,7 +209,9 @@ def adapted(
         return Adapter(make_one, **adaption, **options)
 
     def check():
-        make(num_envs=1, seed=0, frame_size=1).close()
+        from srl_jax.envs.adapter import check
+
+        check(make)
 
     return Game(make, check, own_size=True, frames_per_step=frame_skip)
 

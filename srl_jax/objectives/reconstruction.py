@@ -31,6 +31,7 @@ def patch_mask(key: Array, height: int, width: int, share: float, side: int) -> 
 
     The image is cut into squares of `side` pixels, each of which is hidden with probability `share`.
     """
+    side = min(side, max(height, width))
     kept = jax.random.uniform(key, (-(-height // side), -(-width // side)), jnp.float32) >= share
     return jnp.repeat(jnp.repeat(kept, side, 0), side, 1)[:height, :width, None].astype(jnp.float32)
 

@@ -69,6 +69,11 @@ def shows(space, shown, **attributes):
     return type("Other", (Square,), {"observation_space": space, "shown": shown, **attributes})
 
 
+def other(**attributes):
+    """A Square that does something else."""
+    return shows(Square.observation_space, Square.image, **attributes)
+
+
 class Turns(gymnasium.Env):
     """Turned by a number; shows a vector of three, and is over once they add up to 2."""
 
@@ -274,6 +279,9 @@ def broken(self):
     raise KeyError("a\nb")
 
 
+ONE = Square()
+
+
 @pytest.mark.parametrize(
     ("kind", "says"),
     [
@@ -292,6 +300,16 @@ def broken(self):
             "takes actions of MultiBinary(3)",
         ),
         (shows(Square.observation_space, None, __init__=broken), "cannot be made: KeyError: 'a\\nb'"),
+        (list, "is no gymnasium.Env: its function makes a list"),
+        (lambda: ONE, "gives one environment twice"),
+        (other(get_action_meanings=[1, 2]), "its get_action_meanings must be a list of names"),
+        (other(state_names="column"), "its state_names must be a list of names"),
+        (
+            other(step=lambda self, action: (self.image(), 0, False, {})),
+            "cannot be reset and stepped: ValueError: not enough values to unpack",
+        ),
+        (other(reset=lambda self: (self.image(), {})), "unexpected keyword argument 'seed'"),
+        (other(info=lambda self: None), "info['state'] must hold the 1 numbers"),
     ],
 )
 def test_what_cannot_be_played_is_refused_in_one_line(kind, says):
@@ -300,6 +318,18 @@ def test_what_cannot_be_played_is_refused_in_one_line(kind, says):
         game.check()
     assert says in str(raised.value) and "\n" not in str(raised.value)
     envs.adapted(Square).check()
+
+
+def test_names_are_given_as_a_list_or_by_a_function():
+    for names in (["left", "right"], lambda self: ["left", "right"]):
+        env = make(other(get_action_meanings=names, state_names=lambda self: ("x",)))
+        assert list(env.action_meanings) == ["left", "right"] and env.state_names == ("x",)
+
+
+def test_what_is_rendered_in_its_own_size_must_be_an_image():
+    game = envs.adapted(other(render=lambda self: None), render=True)
+    with pytest.raises(ConfigError, match=r"must render images; it gave object \[\]"):
+        game.make(num_envs=1, seed=0, frame_size=0)
 
 
 def test_what_is_shown_must_be_what_was_announced():

@@ -74,6 +74,8 @@ def test_corruption_hides_whole_patches_in_all_frames_and_is_seen_by_the_encoder
     patches = frames.reshape(*frames.shape[:2], 3, 4, 3, 4)
     assert np.all(patches.max((3, 5)) == patches.min((3, 5)))
     assert np.all(frames == frames[:, :1]) and 0.2 < frames.mean() < 0.8
+    whole, larger = (corrupted(window, jax.random.key(0), 0.0, 0.5, side).frames for side in (12, 65_536))
+    np.testing.assert_array_equal(whole, larger)
     noisy = np.asarray(corrupted(window, jax.random.key(0), 0.5, 0.0, 4).frames)
     assert 0 <= noisy.min() < noisy.max() == 1
 
