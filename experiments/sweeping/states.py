@@ -69,16 +69,17 @@ def look(path: Path, config: Config) -> State:
     if blank:
         return State("missing")
     ended = ending.read(path)
-    if not (path / "checkpoints").exists() and ended is not None and ended.status == "finished":
+    finished = ended is not None and ended.status == "finished"
+    if finished and not (path / "checkpoints").exists():
         return State("done", ended.env_steps)
     try:
         found = checkpoint.read_manifest(path)
     except ConfigError:
         return State("resumable")  # from an older one, or not begun: the run itself finds out
-    over = NUMBERS not in found.files or (ended is not None and ended.status == "finished")  # --keep_replay
+    over = NUMBERS not in found.files or finished  # of --keep_replay
     if not over or _another_run(found.config, config):
         return State("resumable", found.env_steps)
-    lacks = resuming.lacks(path, found)
+    lacks = resuming.lacks(path, found) or ("" if finished else f"{ending.FILE}, which says that it is over")
     return State("resumable" if lacks else "done", found.env_steps, lacks)
 
 

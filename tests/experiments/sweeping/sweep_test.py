@@ -23,7 +23,7 @@ from experiments.sweeping.manifest import Entry
 from experiments.sweeping.plan import Planned
 from srl_jax.config import Config
 from srl_jax.errors import ConfigError, SaveError
-from srl_jax.files import checkpoint, rundir
+from srl_jax.files import checkpoint, resuming, rundir
 from srl_jax.run import ending
 from srl_jax.run.ending import Ending
 from srl_jax.training import completed
@@ -48,6 +48,7 @@ def complete(run, config, state=None):
     checkpoint.save(run, {"encoder": {"w": np.zeros(2)}}, config, state=state, **counts)
     row = {"kind": "eval", "env_steps": 500, "updates": 1, "wall_s": 5.0, "eval/return_mean": 0.5}
     (run / "metrics.jsonl").write_text(json.dumps(row) + "\n")
+    ending.write(run, Ending("finished", 500))
 
 
 class Sweep:
@@ -160,8 +161,21 @@ def test_a_run_that_ends_well_has_to_be_complete(stubs, spoil):
 def test_a_run_that_kept_its_replay_is_complete_once_it_has_finished(tmp_path):
     complete(tmp_path, CONFIG, checkpoint.State({}, {}, {}))
     CONFIG.save(tmp_path)
+    assert states.look(tmp_path, CONFIG) == ("done", 500, "")
+    ending.clear(tmp_path)
     assert states.look(tmp_path, CONFIG) == ("resumable", 500, "")
-    ending.write(tmp_path, Ending("finished", 500))
+
+
+def test_a_run_that_was_killed_before_it_said_that_it_is_over_is_resumed(tmp_path):
+    # Its parameters alone are left: it has done everything, and is no complete run for those who read it.
+    complete(tmp_path, CONFIG)
+    CONFIG.save(tmp_path)
+    for how in (None, Ending("stopped", 500)):
+        ending.clear(tmp_path)
+        if how:
+            ending.write(tmp_path, how)
+        assert states.look(tmp_path, CONFIG) == ("resumable", 500, "ended.json, which says that it is over")
+    assert resuming.say_finished(tmp_path, checkpoint.read_manifest(tmp_path))
     assert states.look(tmp_path, CONFIG) == ("done", 500, "")
 
 
