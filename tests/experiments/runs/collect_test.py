@@ -152,7 +152,10 @@ def test_other_protocols_are_refused_unless_forced(tmp_path, field, value):
     write_run(tmp_path / "d/seed0", **{field: value})
     runs = collect.load_runs(tmp_path)
     with pytest.raises(ConfigError, match=f"another protocol.*{field} is .*--force"):
-        collect.check_protocols(runs)
+        collect.check_protocols(runs, force=False)
+    with pytest.raises(ConfigError, match=f"another protocol.*{field} is ") as raised:
+        collect.check_protocols(runs)  # of a program that has no such flag
+    assert "--force" not in str(raised.value)
     (line,) = collect.check_protocols(runs, force=True)
     assert f"{field} is {getattr(Config(), field)} there and {value} here" in line
 
