@@ -209,8 +209,9 @@ def commands(results: Path = RESULTS) -> Iterator[tuple[str, list[str]]]:
 
 
 def with_criteria(results: Path = RESULTS) -> list[Path]:
-    """The packed campaigns that have their criteria as data."""
-    return [path.parent for path in sorted(results.glob(f"*/{CRITERIA}")) if packing.is_packed(path.parent)]
+    """The packed campaigns whose criteria are data and were computed before: not those that are under way."""
+    found = [path.parent for path in sorted(results.glob(f"*/{CRITERIA}"))]
+    return [path for path in found if packing.is_packed(path) and (path / WRITTEN[0]).is_file()]
 
 
 def contents(results: Path = RESULTS) -> dict[Path, bytes]:

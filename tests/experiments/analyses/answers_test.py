@@ -89,6 +89,15 @@ def test_a_seed_that_was_left_out_is_asked_for_again(tmp_path, monkeypatch):
     assert "--seeds=0,1,4," in drawn and "--games=Catch,Pong" in drawn
 
 
+def test_criteria_of_a_campaign_that_is_under_way_are_not_computed(tmp_path):
+    for name in ("configs.json", "criteria.json"):
+        (tmp_path / "x").mkdir(exist_ok=True)
+        (tmp_path / "x" / name).write_text("{}")
+    assert answers.with_criteria(tmp_path) == []
+    (tmp_path / "x/tests.json").write_text("{}")
+    assert answers.with_criteria(tmp_path) == [tmp_path / "x"]
+
+
 def test_every_figure_of_a_packed_campaign_is_drawn_again():
     found = dict(answers.commands())
     drawn = {name for name in found if "/" in name}
