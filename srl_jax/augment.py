@@ -236,7 +236,9 @@ def check_views(config: Config, size: int) -> None:
             name, options = split(text)
             texts[f"{flag}={name}:view"] = str(options.get("view", "none"))
     for flag, text in texts.items():
-        for part in () if text in ("none", "same") else text.removesuffix(EACH).split("+"):
+        if text in ("none", "same"):
+            continue
+        for part in text.removesuffix(EACH).split("+"):
             problems = [_problem(VIEWS[part], size, channels) for channels in (1, 3)]
             if all(problems):
                 raise ConfigError(f"--{flag}={text}: {problems[0]}")
@@ -244,16 +246,16 @@ def check_views(config: Config, size: int) -> None:
 
 def _problem(view: Callable[[Array, Array], Array], size: int, channels: int) -> str:
     """What is wrong with a part of a view, or ""."""
-    key = jax.random.key(0)
+    key, foreign = jax.random.key(0), plugins.foreign(view)
     white = jnp.full((2, size, size, channels), 255, jnp.uint8)
     try:
         # To run it takes longer than to look at its shapes, and those of the package give what they should.
-        seen = view(white, key) if plugins.foreign(view) else jax.eval_shape(view, white, key)
+        seen = view(white, key) if foreign else jax.eval_shape(view, white, key)
         shape, dtype = seen.shape, seen.dtype
     except Exception as error:
-        return plugins.reason(error, Path(plugins.origin(view))) if plugins.foreign(view) else str(error)
+        return plugins.reason(error, Path(plugins.origin(view))) if foreign else str(error)
     if shape != white.shape or dtype not in (jnp.uint8, jnp.float32):
         wanted = f"uint8 or float32 of shape {list(white.shape)}"
         return f"gives {dtype} of shape {list(shape)}; it must give {wanted}"
-    most = float(jnp.max(jnp.abs(seen))) if isinstance(seen, jax.Array) and dtype == jnp.float32 else 0.0
+    most = float(jnp.max(jnp.abs(seen))) if foreign and dtype == jnp.float32 else 0.0
     return "" if most <= 2.0 else f"makes {most:g} of a white pixel; float32 must be in [0, 1], or nearly so"
